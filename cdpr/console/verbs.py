@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from executor.drives import is_simulated
+from executor.jogging import FASTEST
 from executor.recording.record_files import RUNS
 from model.errors import CdprError, Refused
 from model.pose import Pose
 from model.rig import Rig
+from model.scene import load_scene
 
 #: Length of a verb's output that is shown, [characters].
 SHOWN = 4000
@@ -26,6 +28,7 @@ STOPPED = 130
 BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 #: Verbs after which drives move, or let go.
 MOVING = frozenset({"home", "jog", "release", "run"})
+_HELD = ("--hold-to-run", "--speed-mm-s", f"{1e3 * FASTEST:g}")
 _REPORT = re.compile(r"(\S+/report\.html)")
 _HELP = re.compile(r"details: cdpr explain (\w+)")
 
@@ -53,6 +56,47 @@ class ConsoleFiles:
     scene_file: Path | None
     without_real_time: bool
     read_only: bool
+
+    # Arguments of verbs, without options of the bus and of real time.
+
+    def home_arguments(self) -> list[str]:
+        """Of `cdpr home`: with the first camera, else on the jig at the rig's home pose."""
+        how = ["--camera", self.cameras[0]] if self.cameras else ["--at-home"]
+        return [str(self.rig_file), *how]
+
+    def run_arguments(self, plan: str, plan_hash: str) -> list[str]:
+        """Of `cdpr run` for a plan file, if it has this hash."""
+        cameras = [text for source in self.cameras for text in ("--camera", source)]
+        if not (cameras or is_simulated(self.rig)):
+            cameras = ["--no-camera"]
+        return [plan, "--rig", str(self.rig_file), "--plan-hash", plan_hash, *cameras]
+
+    def jog_arguments(self, pose: Pose | None) -> list[str]:
+        """Of a session of `cdpr jog`; one that simulates the drives itself begins at a pose."""
+        at: list[str] = []
+        if pose is not None and is_simulated(self.rig):
+            position = [f"{v:.4f}" for v in 1e3 * pose.position]
+            rotation = [f"{v:.9f}" for v in pose.quaternion]
+            at = ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
+        scene = self.scene_file
+        around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
+        return [str(self.rig_file), *_HELD, *around, *at]
+
+    def cable_arguments(self) -> list[str]:
+        """Of a session of `cdpr jog` for single cables."""
+        return [str(self.rig_file), *_HELD, "--one-cable"]
+
+    def plan_arguments(self, scene: Path, output: Path, objective: str) -> list[str]:
+        """Of `cdpr plan` for a scene file.
+
+        Raises:
+            BadInput: The scene cannot be read.
+        """
+        cost = [] if objective == "shortest" else ["--cost", objective]
+        if load_scene(scene).rotation_limits is not None:
+            cost.append("--free-rotation")
+        options = ["-o", str(output), "--force", *cost, *self.calibration_options]
+        return [str(self.rig_file), str(scene), *options]
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,13 +253,17 @@ def _without_commands(text: str) -> str:
     return re.sub(r"(?m)^\s*next:?\s+cdpr .*\n?", "", text)
 
 
-def start_options(rig: Rig, pose: Pose | None) -> list[str]:
-    """Options of `cdpr jog` that begin at a pose, where it simulates the drives itself."""
-    if pose is None or not is_simulated(rig):
-        return []
-    position = [f"{v:.4f}" for v in 1e3 * pose.position]
-    rotation = [f"{v:.9f}" for v in pose.quaternion]
-    return ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
+def busy_state(verb: str | None, line: str, loading: str | None) -> dict[str, str] | None:
+    """What the console is doing, if anything.
+
+    Args:
+        verb: That is running.
+        line: The last one of its output.
+        loading: The plan that is being read and checked.
+    """
+    if verb is not None:
+        return {"verb": verb, "text": line}
+    return None if loading is None else {"verb": "load", "text": loading}
 
 
 def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:

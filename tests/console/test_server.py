@@ -31,10 +31,17 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from cdpr.cli.operate.run import show
-from cdpr.console import server
-from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
+from cdpr.console import server, session, view
+from cdpr.console.commands import (
+    MOST_WAITING,
+    Held,
+    LetGo,
+    PlainCommand,
+    Seen,
+    parse_message,
+)
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
-from cdpr.console.session import Console
+from cdpr.console.session import LONGEST_WAIT, Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
 from cdpr.console.verbs import (
     ConsoleFiles,
@@ -43,6 +50,7 @@ from cdpr.console.verbs import (
     _without_commands,
     outcome_state,
 )
+from cdpr.console.view import preview
 from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
 from executor.interlock.fault_latch import FaultLatch
@@ -55,9 +63,9 @@ from executor.run_result import RunResult
 from executor.state_machine import State
 from executor.supervision import LocalRequests, Supervisor
 from model.errors import BadInput, Refused
-from model.plan import load_plan, save_plan
+from model.plan import Plan, load_plan, save_plan
 from model.pose import Pose
-from model.rig import load_rig
+from model.rig import Rig, load_rig
 from model.scene import load_scene
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, write_short_plan
 from tests.cli.program import call
@@ -646,14 +654,96 @@ def test_stop_waits_for_no_other_command_of_any_page(
         load = {"kind": "command", "id": 1, "command": "load_plan", "file": "short.json"}
         me.send(json.dumps(load))
         assert begun.wait(60)
-        for page in pages[1:]:  # they wait in turn, in threads of the server
-            page.send(json.dumps(load))
+        for page in pages[1:]:  # without control they do not wait
+            assert answer_to(page, json.dumps(load))["what"] == "take control first"
         for page in (me, pages[-1]):
             answer = command(page, "stop")
             assert (answer["to"], answer["what"]) == (7, "nothing moves")
         for _ in range(2 * MOST_WAITING):
             me.send(json.dumps(load))
-        assert "not finished yet" in command(me, "hold")["what"]
+        assert "not finished yet" in command(me, "home")["what"]
+
+
+@contextmanager
+def loading(
+    served: Served, page: ClientConnection, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[threading.Event]:
+    """A plan is being loaded by a page with control, until the event is set."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def check_slowly(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
+        begun.set()
+        go_on.wait(60)
+        return preview(path, plan, rig)
+
+    monkeypatch.setattr(view, "preview", check_slowly)
+    assert command(page, "take_control")["ok"]
+    load = {"kind": "command", "id": 1, "command": "load_plan", "file": "short.json"}
+    page.send(json.dumps(load))
+    assert begun.wait(60)
+    try:
+        yield go_on
+    finally:
+        go_on.set()
+
+
+def test_a_run_is_held_resumed_and_slowed_down_while_a_plan_is_being_loaded(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run may be that of a terminal; a long plan is checked for minutes."""
+    with served.page() as page, loading(served, page, monkeypatch):
+        for name, values in (("hold", {}), ("resume", {}), ("speed", {"percent": 30})):
+            assert command(page, name, **values)["ok"]
+            assert served.said[-1] == (name, values)
+        assert state(page)["busy"] == {"verb": "load", "text": "short.json"}
+
+
+@pytest.mark.parametrize("name", ["home", "release", "jog_begin", "run", "reset", "plan"])
+def test_a_command_that_waited_too_long_is_not_begun(
+    served: Served, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its page has reported that it got no answer: no one expects a motion any more."""
+    values = {"run": {"plan": "hash"}, "reset": {"cause": None}, "plan": {"scene": "s.yaml"}}
+    clock = time.clock_gettime
+    with served.page() as page, loading(served, page, monkeypatch) as go_on:
+        asked = {"kind": "command", "id": 2, "command": name, **values.get(name, {})}
+        page.send(json.dumps(asked))
+        assert command(page, "hold")["ok"], "by then the command has arrived"
+        monkeypatch.setattr(time, "clock_gettime", lambda which: clock(which) + LONGEST_WAIT)
+        go_on.set()
+        while (answer := receive(page)).get("to") != 2:
+            pass
+        assert (answer["ok"], "was not begun" in answer["what"]) == (False, True)
+        assert served.started == []
+        assert state(page)["busy"] is None
+        assert command(page, "home")["ok"]
+        assert [verb for verb, _ in served.started] == ["home"]
+
+
+def test_a_command_does_not_wait_long_for_one_of_another_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as the loading of a plan that was made here, or a reading of the drives."""
+    monkeypatch.setattr(session, "LONGEST_WAIT", 0.01)
+    served = Served()
+    page = served.console.control.join("test")
+    served.console.control.take(page, moving=False)
+    home = PlainCommand(kind="command", command="home")
+    held, go_on = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with served.console._one_at_a_time:
+            held.set()
+            go_on.wait(60)
+
+    other = threading.Thread(target=work)
+    other.start()
+    assert held.wait(60)
+    answer = served.console.command(page, home, arrived_now())
+    go_on.set()
+    other.join()
+    assert (answer, served.started) == ("another command is not finished yet", [])
+    served.console.close()
 
 
 @pytest.mark.parametrize(
