@@ -38,6 +38,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drivers.can_bus import BusSettings
 from drivers.factory import drive_flags, drive_states
 from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
@@ -139,9 +140,8 @@ class CyclesSoFar:
 
 
 def bus_name(rig: Rig) -> str:
-    """The bus of a rig, as in a status."""
-    bus = rig.document.bus
-    return f"{bus.interface} {bus.channel}".strip()
+    """The bus of a rig, as in a status; the same text for every spelling in rig files."""
+    return BusSettings.of(rig).canonical.strip()
 
 
 def identity(rig: Rig, folder: Path | None) -> dict[str, Any]:

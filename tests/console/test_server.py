@@ -54,11 +54,11 @@ from cdpr.console.view import preview
 from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
 from executor.interlock.fault_latch import FaultLatch
-from executor.remote.client import stop_runs
+from executor.remote.client import preparations, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
-from executor.remote.status import bus_name
+from executor.remote.status import bus_name, identity
 from executor.run_result import RunResult
 from executor.state_machine import State
 from executor.supervision import LocalRequests, Supervisor
@@ -886,6 +886,26 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
             assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
     assert [verb for verb, _ in served.started] == ["reset"] * 2
     console.close()
+
+
+@pytest.mark.parametrize("kind", ["udp_multicast", "slcan"])
+def test_a_motion_is_found_however_its_rig_file_spells_the_bus(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "ttyACM0").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyACM0")
+    names = {
+        "udp_multicast": ("239.74.163.67", "239.74.163.67:43113"),
+        "slcan": (str(tmp_path / "ttyACM0"), str(tmp_path / "by-id")),
+    }
+    here, there = (load_rig(RIG).with_bus(kind, name) for name in names[kind])
+    watch = RunWatch(bus_name(here))
+    with commands_from_start("run", there, Supervisor(), realtime=False) as ahead:
+        assert [one["process"] for one in preparations(bus_name(here))] == [os.getpid()]
+        assert watch.why_busy() == "a motion is being prepared; wait, or stop it"
+        moving: Any = SimpleNamespace(as_dict=lambda: {**identity(there, None), "state": "moving"})
+        with ahead.during_motion(moving):
+            assert watch.update().status is not None
+            assert watch.why_busy() == "the robot moves; wait, or stop it"
+    watch.close()
 
 
 def test_a_motion_prepared_elsewhere_is_shown_and_gives_way_to_a_run() -> None:
