@@ -81,9 +81,9 @@ class Console:
             BadInput: The scene, or the file of taught poses, cannot be read.
         """
         self.files, self.rig = files, files.rig
-        file = files.scene_file
-        self.scene = None if file is None else load_scene(file)
-        self.control, self.verbs = PageControl(lambda: time.time_ns() // 1_000_000), StartedVerb()
+        self.scene = files.scene_file and load_scene(files.scene_file)
+        self.control = PageControl(lambda: time.time_ns() // 1_000_000)
+        self.verbs = StartedVerb([files.rig_file, *map(Path, files.calibration_options[1::2])])
         # Drives simulated by each run share no bus: other robots' runs have the same bus name.
         only = self.rig.name if is_simulated(self.rig) else None
         self.watch = RunWatch(bus_name(self.rig), only)

@@ -124,8 +124,13 @@ class StartedVerb:
     A file could not be written on a full disk, nor be removed after the end of the console.
     """
 
-    def __init__(self) -> None:
-        """Before any verb."""
+    def __init__(self, files: Sequence[Path]) -> None:
+        """Before any verb.
+
+        Args:
+            files: That describe the robot, to the console and to the verbs, which read them again.
+        """
+        self._contents = {file: _content(file) for file in files}
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._output = -1
@@ -147,10 +152,12 @@ class StartedVerb:
                 finds the verb started, and ends it.
 
         Raises:
-            Refused: Another verb is running, or it is not to be started.
+            Refused: Another verb is running, a file changed that describes the robot, or the verb
+                is not to be started.
         """
         with self._lock:
             require()
+            self._require_same_robot()
             self._update()
             if self.verb is not None:
                 raise Refused(
@@ -159,6 +166,16 @@ class StartedVerb:
                     next_step="wait until it ends, or stop it",
                 )
             self._start(verb, arguments)
+
+    def _require_same_robot(self) -> None:
+        for file, content in self._contents.items():
+            if _content(file) != content:
+                raise Refused(
+                    f"{file} changed since the console began",
+                    where="console",
+                    why="the page shows the robot as it was described then",
+                    next_step="restart the console; nothing was started",
+                )
 
     def fail(self, error: CdprError) -> None:
         """Notes that the last verb's result cannot be used, unless another one was started."""
@@ -231,6 +248,14 @@ class StartedVerb:
             self._process = self.verb = None
         lines = text.strip().splitlines()
         return lines[-1].strip() if lines else ""
+
+
+def _content(file: Path) -> bytes | None:
+    """Content of a file; None if it cannot be read."""
+    try:
+        return file.read_bytes()
+    except OSError:
+        return None
 
 
 def _outcome(verb: str, code: int, text: str) -> VerbOutcome:

@@ -831,6 +831,38 @@ def test_a_run_that_waits_for_its_drives_begins_only_if_it_is_still_wanted(
     console.close()
 
 
+@pytest.mark.parametrize("change", ["edit", "remove", "calibrate", "touch"])
+def test_no_verb_is_started_for_another_robot_than_the_page_shows(
+    tmp_path: Path, change: str
+) -> None:
+    """After an edit of the rig file homing succeeded, and the page said "Not homed" for ever."""
+    rig, result = tmp_path / "rig.yaml", tmp_path / "result.yaml"
+    rig.write_bytes(RIG.read_bytes())
+    result.write_text("the result")
+    calibration = ("--calibration", str(result))
+    console = Console(ConsoleFiles(rig, load_rig(RIG), (), calibration, (), None, True, False))
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    changes: dict[str, Callable[[], object]] = {
+        "edit": lambda: rig.write_text(rig.read_text().replace("gachon_8_6", "another")),
+        "remove": rig.unlink,
+        "calibrate": lambda: result.write_text("another"),
+        "touch": rig.touch,
+    }
+    changes[change]()
+    started: list[str] = []
+    console.verbs._start = lambda verb, _: started.append(verb)  # type: ignore[method-assign]
+    why_not = console.command(page, PlainCommand(kind="command", command="home"), arrived_now())
+    if change == "touch":
+        assert (why_not, started) == ("", ["home"])
+    else:
+        name = result if change == "calibrate" else rig
+        assert started == []
+        assert f"{name} changed since the console began" in why_not
+        assert "restart the console" in why_not
+    console.close()
+
+
 def test_a_stop_finds_each_verb_either_started_or_refused() -> None:
     """It waits for a start that has passed the check, and ends what was started."""
     console = Served().console
