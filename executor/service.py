@@ -105,7 +105,7 @@ class StatusResult(FactsDisplay):
         """
         latched = self.latched or "none"
         if self.run is not None:
-            latched = f"none; process {self.run} is moving or resetting the rig, see `cdpr monitor`"
+            latched += f"; process {self.run} is moving or resetting the rig, see `cdpr monitor`"
         facts = [
             ("rig", self.rig),
             ("bus", self.bus),
@@ -205,17 +205,17 @@ def status(rig: Rig) -> StatusResult:
     require_other_process(rig)
     settings = BusSettings.of(rig)
     interlock = MotionInterlock(rig)
-    latched, in_motion = FaultLatch(settings).read_in_motion()
+    latched, run = FaultLatch(settings).read_in_motion()
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),
-        run=latched.process if latched and in_motion else None,
+        run=run,
         preparing=tuple(one["process"] for one in preparations(bus_name(rig))),
-        latched=latched.cause if latched and not in_motion else None,
+        latched=latched.cause if latched else None,
         being_set_up=False,
         reference=reference_status(interlock),
     )
-    if in_motion:
+    if run is not None:
         return known
     try:
         with SetUpLock(settings).tried() as alone, before_motion():

@@ -1080,6 +1080,10 @@ def test_a_reset_of_this_user_is_no_motion_of_another(monkeypatch: pytest.Monkey
     with monkeypatch.context() as patch:
         patch.setattr(os, "getpid", lambda: 2**30)  # of no process
         latch.engage(console.rig.name, Path("runs/mine"))
+    latch.let_go()
+    shown = latch.read()
+    assert shown is not None
+    latch.hold_engaged(shown)
     require_only_latched(console, "did not finish")
     latch.let_go()
     latch.disengage()
