@@ -436,15 +436,10 @@ def _released(
     def on_armed(denied: str) -> None:
         if denied:
             listener.remark(denied)
-        status.take_release()
 
     with ExitStack() as stack:
         stack.enter_context(commands.during_motion(status))
         process = stack.enter_context(make_process(board))
-        try:
-            left = release_drives(rig, interlock, process, on_armed, under)
-        except CdprError as error:
-            status.take_end(State.LATCHED, error.what)
-            raise
+        left = release_drives(rig, interlock, process, on_armed, status.take_release, under)
         status.take_end(State.FINISHED, "")
         return left

@@ -81,7 +81,7 @@ class Console:
             BadInput: The scene, or the file of taught poses, cannot be read.
         """
         self.files, self.rig = files, files.rig
-        self.scene = files.scene_file and load_scene(files.scene_file)
+        self.scene = load_scene(files.scene_file) if files.scene_file else None
         self.control = PageControl(lambda: time.time_ns() // 1_000_000)
         self.verbs = StartedVerb([files.rig_file, *map(Path, files.calibration_options[1::2])])
         # Drives simulated by each run share no bus: other robots' runs have the same bus name.
