@@ -414,6 +414,16 @@ def test_ctrl_c_by_a_stop_is_a_stop_and_ctrl_c_alone_is_ctrl_c(folders):
         interrupted(False)
 
 
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_the_record_of_a_stop_by_root_can_be_read_by_users(folders, umask):
+    before = os.umask(umask)
+    try:
+        record_stop()
+    finally:
+        os.umask(before)
+    assert [(folder / "stopped").stat().st_mode & 0o777 for folder in folders] == [0o644] * 2
+
+
 @pytest.mark.parametrize("is_later", [True, False])
 def test_a_stop_reaches_a_program_that_was_started_before_it_and_answers_later(folders, is_later):
     """Such as one that is still loading: it has no socket yet."""
