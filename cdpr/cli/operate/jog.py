@@ -213,7 +213,8 @@ def jog(
     if held.hold_to_run or held.keys:
         unused = given_options(distance) | {"--output": output} | no_effect
         require_unused("cdpr jog", unused, "held controls set the direction, in real time")
-        keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
+        fastest = jogging.with_speed(the_rig, speed).motion.speed
+        keys = JogKeys(Keys(), 1000.0 * fastest) if held.keys else None
         session = partial(
             jog_session,
             the_rig,
