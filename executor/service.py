@@ -73,7 +73,7 @@ class StatusResult(FactsDisplay):
         run: ID of the process that moves or resets it.
         preparing: IDs of processes that prepare a motion.
         latched: Cause of a latched fault.
-        being_set_up: Another program configures or reads the drives.
+        being_set_up: Another program prepares a motion of the drives or reads them.
         reference: Homing reference of the drives.
         drives: The drives that answered, in the order of the rig file.
         pose: By the drives, without a load, ``world_from_platform``.
@@ -206,16 +206,17 @@ def status(rig: Rig) -> StatusResult:
     settings = BusSettings.of(rig)
     interlock = MotionInterlock(rig)
     latched, run = FaultLatch(settings).read_in_motion()
+    preparing = tuple(one["process"] for one in preparations(bus_name(rig)))
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),
         run=run,
-        preparing=tuple(one["process"] for one in preparations(bus_name(rig))),
+        preparing=preparing,
         latched=latched.cause if latched else None,
-        being_set_up=False,
+        being_set_up=bool(preparing),
         reference=reference_status(interlock),
     )
-    if run is not None:
+    if run is not None or preparing:
         return known
     try:
         with SetUpLock(settings).tried() as alone, before_motion():
