@@ -179,7 +179,7 @@ def jog(
     """
     the_rig = bus.rig(rig)
     require_own_time(the_rig, not drives.fast)
-    speed = speed_mm_s / 1000.0
+    speed = min(speed_mm_s / 1000.0, the_rig.motion.speed)
     path = given_options(distance) | given_options(surroundings) | {"--output": output}
     if cable is not None or mm is not None:
         why = "a single cable is moved without a path, and obstacles are not checked"
@@ -213,8 +213,7 @@ def jog(
     if held.hold_to_run or held.keys:
         unused = given_options(distance) | {"--output": output} | no_effect
         require_unused("cdpr jog", unused, "held controls set the direction, in real time")
-        fastest = jogging.with_speed(the_rig, speed).motion.speed
-        keys = JogKeys(Keys(), 1000.0 * fastest) if held.keys else None
+        keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
         session = partial(
             jog_session,
             the_rig,
