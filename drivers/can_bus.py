@@ -117,8 +117,7 @@ class BusSettings:
             options = _udp_options(self)
             channel = f"{options['channel']}:{options.get('port', UDP_DEFAULT_PORT)}"
         elif channel.startswith("/"):  # a serial adapter, which has several names in /dev
-            device, at, speed = channel.partition("@")
-            channel = f"{os.path.realpath(device)}{at}{speed}"
+            channel = os.path.realpath(channel.partition("@")[0])  # without its speed
         return f"{interface} {channel}"
 
     def __str__(self) -> str:

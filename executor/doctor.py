@@ -170,10 +170,15 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
 
 
 def rig_bus(rig: Rig) -> list[MachineCheck]:
-    """Whether the bus of a rig is fast enough, is set up, and can be opened."""
+    """Whether the bus of a rig is fast enough, is set up, and can be opened.
+
+    It is not opened while another program uses it: that would close the channel of a serial
+    adapter during a motion.
+    """
     # Imported after the check of libraries: needs python-can.
     from drivers.can_bus import IN_PROCESS, BusSettings, can_interfaces, open_bus
     from drivers.can_load import check_bus_load
+    from executor.interlock.locks import SetUpLock
 
     settings = BusSettings.of(rig)
     checks: list[MachineCheck] = []
@@ -188,8 +193,11 @@ def rig_bus(rig: Rig) -> list[MachineCheck]:
         except CdprError as error:
             checks.append(MachineCheck("interfaces", False, error.what, error.next_step))
     try:
-        open_bus(settings).shutdown()
-        checks.append(MachineCheck(f"bus {settings}", True, "opens"))
+        with SetUpLock(settings).tried() as alone:
+            if alone:
+                open_bus(settings).shutdown()
+        text = "opens" if alone else "in use by another program, not opened"
+        checks.append(MachineCheck(f"bus {settings}", True, text))
     except CdprError as error:
         checks.append(MachineCheck(f"bus {settings}", False, error.what, error.next_step))
     if settings.interface != IN_PROCESS:

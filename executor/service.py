@@ -73,7 +73,7 @@ class StatusResult(FactsDisplay):
         run: ID of the process that moves or resets it.
         preparing: IDs of processes that prepare a motion.
         latched: Cause of a latched fault.
-        being_set_up: Another program configures or reads the drives.
+        being_set_up: Another program prepares a motion of the drives or reads them.
         reference: Homing reference of the drives.
         drives: The drives that answered, in the order of the rig file.
         pose: From the encoders, without a load, ``world_from_platform``.
@@ -105,7 +105,7 @@ class StatusResult(FactsDisplay):
         """
         latched = self.latched or "none"
         if self.run is not None:
-            latched = f"none; process {self.run} is moving or resetting the rig, see `cdpr monitor`"
+            latched += f"; process {self.run} is moving or resetting the rig, see `cdpr monitor`"
         facts = [
             ("rig", self.rig),
             ("bus", self.bus),
@@ -205,17 +205,18 @@ def status(rig: Rig) -> StatusResult:
     require_other_process(rig)
     settings = BusSettings.of(rig)
     interlock = MotionInterlock(rig)
-    latched, in_motion = FaultLatch(settings).read_in_motion()
+    latched, run = FaultLatch(settings).read_in_motion()
+    preparing = tuple(one["process"] for one in preparations(bus_name(rig)))
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),
-        run=latched.process if latched and in_motion else None,
-        preparing=tuple(one["process"] for one in preparations(bus_name(rig))),
-        latched=latched.cause if latched and not in_motion else None,
-        being_set_up=False,
+        run=run,
+        preparing=preparing,
+        latched=latched.cause if latched else None,
+        being_set_up=bool(preparing),
         reference=reference_status(interlock),
     )
-    if in_motion:
+    if run is not None or preparing:
         return known
     try:
         with SetUpLock(settings).tried() as alone, before_motion():
@@ -436,15 +437,10 @@ def _released(
     def on_armed(denied: str) -> None:
         if denied:
             listener.remark(denied)
-        status.take_release()
 
     with ExitStack() as stack:
         stack.enter_context(commands.during_motion(status))
         process = stack.enter_context(make_process(board))
-        try:
-            left = release_drives(rig, interlock, process, on_armed, under)
-        except CdprError as error:
-            status.take_end(State.LATCHED, error.what)
-            raise
+        left = release_drives(rig, interlock, process, on_armed, status.take_release, under)
         status.take_end(State.FINISHED, "")
         return left

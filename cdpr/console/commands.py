@@ -24,8 +24,10 @@ from executor.supervision import FASTEST, SLOWEST
 
 #: Longest message, [bytes].
 LONGEST = 4096
-#: Largest number of queued commands per page; STOP is never queued.
+#: Largest number of queued commands per page and queue; STOP is never queued.
 MOST_WAITING = 8
+#: Commands to a run that moves: they wait for no other command, such as loading a plan.
+TO_RUN = frozenset({"hold", "resume", "speed"})
 
 Text = Annotated[str, Field(max_length=400)]
 Millimetres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
@@ -267,6 +269,7 @@ class Inbox:
 
     Attributes:
         commands: To be executed in order, with the time of arrival, [s] of `CLOCK_BOOTTIME`.
+        to_run: The same for commands of `TO_RUN`.
         refused: Refused commands, by number, and why.
         held: The newest report of a press: its number, the message, and when it arrived.
         released: The newest press that is over.
@@ -275,9 +278,18 @@ class Inbox:
     def __init__(self) -> None:
         """Starts empty."""
         self.commands: asyncio.Queue[tuple[Message, float]] = asyncio.Queue(MOST_WAITING)
+        self.to_run: asyncio.Queue[tuple[Message, float]] = asyncio.Queue(MOST_WAITING)
         self.refused: asyncio.Queue[tuple[int, str]] = asyncio.Queue(MOST_WAITING)
         self.held = Newest[tuple[int, Held, float]]()
         self.released = Newest[int]()
+
+    def take(self, message: Message) -> None:
+        """Queues a command that arrives now, or refuses it if its queue is full."""
+        queue = self.to_run if message.command in TO_RUN else self.commands
+        try:
+            queue.put_nowait((message, time.clock_gettime(time.CLOCK_BOOTTIME)))
+        except asyncio.QueueFull:
+            self.refuse(message.id, "earlier commands of this page are not finished yet")
 
     def refuse(self, command: int, why: str) -> None:
         """Queues the answer to a refused message; drops it if the page does not read answers."""

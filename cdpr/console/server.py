@@ -6,7 +6,6 @@ import asyncio
 import errno
 import secrets
 import socket
-import time
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager, contextmanager, suppress
@@ -239,7 +238,8 @@ class ConsoleServer:
             asyncio.create_task(_or_disconnect(page, work))
             for work in (
                 self._send_states(page, number, flow),
-                self._execute_commands(page, number, inbox),
+                self._execute_commands(page, number, inbox.commands),
+                self._execute_commands(page, number, inbox.to_run),
                 self._forward_held(inbox),
                 self._forward_releases(inbox),
                 _send_refusals(page, inbox),
@@ -298,18 +298,18 @@ class ConsoleServer:
             stopping = asyncio.create_task(self._stop_and_answer(page, message))
             self._stopping.add(stopping)  # completes even if the page disconnects
             stopping.add_done_callback(self._stopping.discard)
-        elif inbox.commands.full():
-            inbox.refuse(message.id, "earlier commands of this page are not finished yet")
         else:
-            inbox.commands.put_nowait((message, time.clock_gettime(time.CLOCK_BOOTTIME)))
+            inbox.take(message)
 
     async def _stop_and_answer(self, page: WebSocket, message: Message) -> None:
         why_not = await _run_in(self._stops, self._console.stop)
         await _answer(page, message.id, why_not)
 
-    async def _execute_commands(self, page: WebSocket, number: int, inbox: Inbox) -> None:
+    async def _execute_commands(
+        self, page: WebSocket, number: int, queue: asyncio.Queue[tuple[Message, float]]
+    ) -> None:
         while True:
-            message, arrived = await inbox.commands.get()
+            message, arrived = await queue.get()
             why_not = await run_in_threadpool(self._console.command, number, message, arrived)
             await _answer(page, message.id, why_not)
 

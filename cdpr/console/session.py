@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cdpr.console.commands import (
+    TO_RUN,
     CompareCommand,
     FileCommand,
     ForgetCommand,
@@ -44,7 +45,7 @@ from cdpr.console.state import (
     stored_state,
 )
 from cdpr.console.teach import TaughtPoses, picked_pose, scene_text
-from cdpr.console.verbs import ConsoleFiles, StartedVerb, outcome_state, start_options
+from cdpr.console.verbs import ConsoleFiles, StartedVerb, busy_state, outcome_state
 from cdpr.console.view import (
     LoadedPlan,
     RobotView,
@@ -54,7 +55,6 @@ from cdpr.console.view import (
 )
 from cdpr.console.watch import CameraImages, RobotWatch, RunWatch
 from executor.drives import is_simulated
-from executor.jogging import FASTEST
 from executor.remote.client import stop_runs
 from executor.remote.command_socket import is_stopped_since
 from executor.remote.status import bus_name
@@ -67,6 +67,8 @@ from model.scene import empty_scene, load_scene
 
 #: Shortest period of reading the fault latch and the reference, [s].
 STORED_EVERY = 0.5
+#: A command that waited longer is not begun, [s]: a page reports after 5 s that it got no answer.
+LONGEST_WAIT = 4.0
 
 
 class Console:
@@ -79,9 +81,9 @@ class Console:
             BadInput: The scene, or the file of taught poses, cannot be read.
         """
         self.files, self.rig = files, files.rig
-        file = files.scene_file
-        self.scene = None if file is None else load_scene(file)
-        self.control, self.verbs = PageControl(lambda: time.time_ns() // 1_000_000), StartedVerb()
+        self.scene = load_scene(files.scene_file) if files.scene_file else None
+        self.control = PageControl(lambda: time.time_ns() // 1_000_000)
+        self.verbs = StartedVerb([files.rig_file, *map(Path, files.calibration_options[1::2])])
         # Drives simulated by each run share no bus: other robots' runs have the same bus name.
         only = self.rig.name if is_simulated(self.rig) else None
         self.watch = RunWatch(bus_name(self.rig), only)
@@ -165,7 +167,7 @@ class Console:
             "homes_by": without_passwords(self.files.cameras[0]) if self.files.cameras else None,
             "home_mm": np.round(1e3 * rig.home.position, 1).tolist(),
             **stored_state(self._stored),
-            "busy": None if verb is None else {"verb": verb, "text": self._line},
+            "busy": busy_state(verb, self._line, self.plan.loading),
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
             "platform": None if robot is None else pose_data(rig, robot.pose, "drives"),
@@ -253,18 +255,28 @@ class Console:
                 press = self.control.give(page)
             self.end_press(press)
             return ""
-        with self._one_at_a_time:
-            if self.control.holder != page:
-                return "take control first"
-            self._require_wanted = partial(self._require, page, arrived)
-            self._require_wanted()
+        if self.control.holder != page:
+            return "take control first"
+        require = partial(self._require, page, arrived)
+        if message.command in TO_RUN:
+            require()
+            percent = {"percent": message.percent} if isinstance(message, SpeedCommand) else {}
+            return self.watch.send(message.command, **percent)
+        if not self._one_at_a_time.acquire(timeout=LONGEST_WAIT):
+            return "another command is not finished yet"
+        try:
+            self._require_wanted = require
+            require()
             return self._operate(message)
+        finally:
+            self._one_at_a_time.release()
 
     def _require(self, page: int, arrived: float) -> None:
         """Requires that no stop came after a command, and that its page still has control.
 
         Raises:
-            Refused: A command that waited, such as for the drives to be read, is not wanted now.
+            Refused: A command that waited, such as for the drives to be read, is not wanted now,
+                or its page has reported that it had no effect.
         """
         if self._stopped >= arrived or is_stopped_since(arrived):
             raise Refused(
@@ -274,6 +286,14 @@ class Console:
             )
         if self.control.holder != page:
             raise Refused("the page lost control before this command began", where="console")
+        waited = time.clock_gettime(time.CLOCK_BOOTTIME) - arrived
+        if waited > LONGEST_WAIT:
+            raise Refused(
+                f"the command waited {waited:.1f} s and was not begun",
+                where="console",
+                why="a plan was being loaded, or the drives were being read",
+                next_step="give it again if it is still wanted; nothing was moved",
+            )
 
     def _operate(self, message: Message) -> str:
         match message:
@@ -281,8 +301,6 @@ class Console:
                 return self._run(message.plan)
             case ResetCommand():
                 return self._reset(message.cause)
-            case SpeedCommand():
-                return self.watch.send("speed", percent=message.percent)
             case FileCommand():
                 self.plan.load(local_file(message.file))
             case CompareCommand():
@@ -310,20 +328,14 @@ class Console:
             return ""
         if command in ("service_begin", "service_end"):
             return self._service(on=command == "service_begin")
-        if command in ("hold", "resume"):
-            return self.watch.send(command)
         verbs: dict[str, Callable[[], str]] = {
-            "home": self._home,
+            "home": partial(self._start_verb, "home", self.files.home_arguments()),
             "release": partial(self._start_verb, "release", [str(self.files.rig_file)]),
             "jog_begin": self._jog_begin,
             "cable_begin": self._cable_begin,
             "jog_end": self._jog_end,
         }
         return verbs[command]()
-
-    def _home(self) -> str:
-        how = ["--camera", self.files.cameras[0]] if self.files.cameras else ["--at-home"]
-        return self._start_verb("home", [str(self.files.rig_file), *how])
 
     def _reset(self, shown: str | None) -> str:
         stored = read_stored(self.rig, is_moving=self.watch.last.status is not None)
@@ -338,26 +350,18 @@ class Console:
             return "a different plan is loaded: review it first"
         if (here := self.robot.pose_at_rest()) is not None and (off := self.plan.off_start(here)):
             return f"the platform is {off} from the plan's start: plan from its current pose"
-        cameras = [text for source in self.files.cameras for text in ("--camera", source)]
-        if not (cameras or is_simulated(self.rig)):
-            cameras = ["--no-camera"]
-        rig = ["--rig", str(self.files.rig_file), "--plan-hash", shown]
-        return self._start_verb("run", [self.plan.preview["name"], *rig, *cameras])
+        arguments = self.files.run_arguments(self.plan.preview["name"], shown)
+        return self._start_verb("run", arguments)
 
     def _jog_begin(self) -> str:
-        scene = self.files.scene_file
-        around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
-        speed = ["--speed-mm-s", f"{1e3 * FASTEST:g}"]
         robot = self.robot.now.robot
-        at = start_options(self.rig, None if robot is None else robot.pose)
-        rig = str(self.files.rig_file)
-        return self._start_verb("jog", [rig, "--hold-to-run", *speed, *around, *at])
+        at = None if robot is None else robot.pose
+        return self._start_verb("jog", self.files.jog_arguments(at))
 
     def _cable_begin(self) -> str:
         if not self.control.is_service:
             return "enter service mode first"
-        how = ["--hold-to-run", "--one-cable", "--speed-mm-s", f"{1e3 * FASTEST:g}"]
-        return self._start_verb("jog", [str(self.files.rig_file), *how])
+        return self._start_verb("jog", self.files.cable_arguments())
 
     def _jog_end(self) -> str:
         """Ends the session of jogs; one that is being prepared takes only a stop."""
@@ -389,12 +393,8 @@ class Console:
         MADE.mkdir(exist_ok=True)
         scene = self._taught_scene(message) if message.scene is None else local_file(message.scene)
         output = MADE / f"{scene.stem}.plan.json"
-        cost = [] if message.objective == "shortest" else ["--cost", message.objective]
-        if load_scene(scene).rotation_limits is not None:
-            cost.append("--free-rotation")
-        rig = str(self.files.rig_file)
-        options = ["-o", str(output), "--force", *cost, *self.files.calibration_options]
-        self.verbs.start("plan", [rig, str(scene), *options], self._require_wanted)
+        arguments = self.files.plan_arguments(scene, output, message.objective)
+        self.verbs.start("plan", arguments, self._require_wanted)
         self.plan.forget()
         self._planned = output
 

@@ -161,16 +161,15 @@ def read_stored(rig: Rig, *, is_moving: bool) -> StoredState:
 
 def _read_latch(rig: Rig) -> tuple[LatchedFault | None, int | None]:
     """The latched fault, or the process of another user that moves or resets the drives."""
-    fault, in_motion = FaultLatch(BusSettings.of(rig)).read_in_motion()
-    if fault is None or not in_motion or not fault.process:
-        return fault, None
-    try:
-        os.kill(fault.process, 0)  # only asks whether it may be signalled
-    except ProcessLookupError:  # its motion is over; a reset or release of the fault is in progress
-        return fault, None
-    except PermissionError:
-        return None, fault.process
-    return None, None
+    fault, process = FaultLatch(BusSettings.of(rig)).read_in_motion()
+    if process:
+        try:
+            os.kill(process, 0)  # only asks whether it may be signalled
+        except ProcessLookupError:  # it has just ended
+            return fault, None
+        except PermissionError:
+            return fault, process
+    return fault, None
 
 
 def not_stopped(rig: Rig) -> str:

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any
 
 from executor.drives import is_simulated
+from executor.jogging import FASTEST
 from executor.recording.record_files import RUNS
 from model.errors import CdprError, Refused
 from model.pose import Pose
 from model.rig import Rig
+from model.scene import load_scene
 
 #: Length of a verb's output that is shown, [characters].
 SHOWN = 4000
@@ -26,6 +28,7 @@ STOPPED = 130
 BEFORE_MOTION = "Stopped during the preparation: nothing was moved."
 #: Verbs after which drives move, or let go.
 MOVING = frozenset({"home", "jog", "release", "run"})
+_HELD = ("--hold-to-run", "--speed-mm-s", f"{1e3 * FASTEST:g}")
 _REPORT = re.compile(r"(\S+/report\.html)")
 _HELP = re.compile(r"details: cdpr explain (\w+)")
 
@@ -54,6 +57,47 @@ class ConsoleFiles:
     without_real_time: bool
     read_only: bool
 
+    # Arguments of verbs, without options of the bus and of real time.
+
+    def home_arguments(self) -> list[str]:
+        """Of `cdpr home`: with the first camera, else on the jig at the rig's home pose."""
+        how = ["--camera", self.cameras[0]] if self.cameras else ["--at-home"]
+        return [str(self.rig_file), *how]
+
+    def run_arguments(self, plan: str, plan_hash: str) -> list[str]:
+        """Of `cdpr run` for a plan file, if it has this hash."""
+        cameras = [text for source in self.cameras for text in ("--camera", source)]
+        if not (cameras or is_simulated(self.rig)):
+            cameras = ["--no-camera"]
+        return [plan, "--rig", str(self.rig_file), "--plan-hash", plan_hash, *cameras]
+
+    def jog_arguments(self, pose: Pose | None) -> list[str]:
+        """Of a session of `cdpr jog`; one that simulates the drives itself begins at a pose."""
+        at: list[str] = []
+        if pose is not None and is_simulated(self.rig):
+            position = [f"{v:.4f}" for v in 1e3 * pose.position]
+            rotation = [f"{v:.9f}" for v in pose.quaternion]
+            at = ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
+        scene = self.scene_file
+        around = ["--no-scene"] if scene is None else ["--scene", str(scene)]
+        return [str(self.rig_file), *_HELD, *around, *at]
+
+    def cable_arguments(self) -> list[str]:
+        """Of a session of `cdpr jog` for single cables."""
+        return [str(self.rig_file), *_HELD, "--one-cable"]
+
+    def plan_arguments(self, scene: Path, output: Path, objective: str) -> list[str]:
+        """Of `cdpr plan` for a scene file.
+
+        Raises:
+            BadInput: The scene cannot be read.
+        """
+        cost = [] if objective == "shortest" else ["--cost", objective]
+        if load_scene(scene).rotation_limits is not None:
+            cost.append("--free-rotation")
+        options = ["-o", str(output), "--force", *cost, *self.calibration_options]
+        return [str(self.rig_file), str(scene), *options]
+
 
 @dataclass(frozen=True, slots=True)
 class VerbOutcome:
@@ -80,8 +124,13 @@ class StartedVerb:
     A file could not be written on a full disk, nor be removed after the end of the console.
     """
 
-    def __init__(self) -> None:
-        """Before any verb."""
+    def __init__(self, files: Sequence[Path]) -> None:
+        """Before any verb.
+
+        Args:
+            files: That describe the robot, to the console and to the verbs, which read them again.
+        """
+        self._contents = {file: _content(file) for file in files}
         self._lock = threading.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._output = -1
@@ -103,10 +152,12 @@ class StartedVerb:
                 finds the verb started, and ends it.
 
         Raises:
-            Refused: Another verb is running, or it is not to be started.
+            Refused: Another verb is running, a file changed that describes the robot, or the verb
+                is not to be started.
         """
         with self._lock:
             require()
+            self._require_same_robot()
             self._update()
             if self.verb is not None:
                 raise Refused(
@@ -115,6 +166,16 @@ class StartedVerb:
                     next_step="wait until it ends, or stop it",
                 )
             self._start(verb, arguments)
+
+    def _require_same_robot(self) -> None:
+        for file, content in self._contents.items():
+            if _content(file) != content:
+                raise Refused(
+                    f"{file} changed since the console began",
+                    where="console",
+                    why="the page shows the robot as it was described then",
+                    next_step="restart the console; nothing was started",
+                )
 
     def fail(self, error: CdprError) -> None:
         """Notes that the last verb's result cannot be used, unless another one was started."""
@@ -189,6 +250,14 @@ class StartedVerb:
         return lines[-1].strip() if lines else ""
 
 
+def _content(file: Path) -> bytes | None:
+    """Content of a file; None if it cannot be read."""
+    try:
+        return file.read_bytes()
+    except OSError:
+        return None
+
+
 def _outcome(verb: str, code: int, text: str) -> VerbOutcome:
     if code == -signal.SIGTERM:
         code, text = STOPPED, f"{text}\n{BEFORE_MOTION}"
@@ -209,13 +278,17 @@ def _without_commands(text: str) -> str:
     return re.sub(r"(?m)^\s*next:?\s+cdpr .*\n?", "", text)
 
 
-def start_options(rig: Rig, pose: Pose | None) -> list[str]:
-    """Options of `cdpr jog` that begin at a pose, where it simulates the drives itself."""
-    if pose is None or not is_simulated(rig):
-        return []
-    position = [f"{v:.4f}" for v in 1e3 * pose.position]
-    rotation = [f"{v:.9f}" for v in pose.quaternion]
-    return ["--simulated-start-mm", *position, "--simulated-start-wxyz", *rotation]
+def busy_state(verb: str | None, line: str, loading: str | None) -> dict[str, str] | None:
+    """What the console is doing, if anything.
+
+    Args:
+        verb: That is running.
+        line: The last one of its output.
+        loading: The plan that is being read and checked.
+    """
+    if verb is not None:
+        return {"verb": verb, "text": line}
+    return None if loading is None else {"verb": "load", "text": loading}
 
 
 def outcome_state(ended: VerbOutcome | None) -> dict[str, Any] | None:

@@ -262,6 +262,8 @@ class LoadedPlan:
         self.preview: dict[str, Any] | None = None
         self.compared: dict[str, Any] | None = None
         self.start: Pose | None = None
+        self.loading: str | None = None
+        """File that is being read and checked, which can take minutes."""
 
     def load(self, path: Path) -> None:
         """Loads a plan for preview.
@@ -270,8 +272,7 @@ class LoadedPlan:
             BadInput: It cannot be read, or is for another rig.
         """
         self.forget()
-        plan = self._read(path)
-        self.preview, self.start = preview(path, plan, self._rig), plan.waypoints[0]
+        self.preview, self.start = self._read(path)
 
     def forget(self) -> None:
         """No plan is loaded; another takes its place."""
@@ -283,12 +284,17 @@ class LoadedPlan:
         Raises:
             BadInput: It cannot be read, or is for another rig.
         """
-        self.compared = None if path is None else preview(path, self._read(path), self._rig)
+        self.compared = None if path is None else self._read(path)[0]
 
-    def _read(self, path: Path) -> Plan:
-        plan = load_plan(path)
-        require_same_rig(plan, self._rig, path)
-        return plan
+    def _read(self, path: Path) -> tuple[dict[str, Any], Pose]:
+        """The preview of a plan, and its start."""
+        self.loading = str(path)
+        try:
+            plan = load_plan(path)
+            require_same_rig(plan, self._rig, path)
+            return preview(path, plan, self._rig), plan.waypoints[0]
+        finally:
+            self.loading = None
 
     def off_mm(self, pose: Pose | None) -> float | None:
         """Distance of a pose from the plan's start, [mm]; None if one is unknown."""

@@ -304,6 +304,7 @@ def release_drives(
     interlock: MotionInterlock,
     process: RealTimeProcess,
     on_armed: Callable[[str], None],
+    on_begun: Callable[[], None],
     under: LatchedFault | None = None,
 ) -> CycleStatus:
     """Switches off the torque, and updates latch and reference.
@@ -313,6 +314,7 @@ def release_drives(
         interlock: Of that rig.
         process: For `Release`.
         on_armed: Called when armed, with what the system denied.
+        on_begun: Called once the latch is engaged; any error after it latches a fault.
         under: Latched fault that stays; see `MotionInterlock.begin`.
 
     Returns:
@@ -329,6 +331,7 @@ def release_drives(
     interlock.begin(record, interlock.still_counts(armed.positions), under=under)
     ended, left, released = _CUT_SHORT, None, False
     try:
+        on_begun()
         ended = process.run()
         released = ended.state is State.FINISHED
         left = process.read_status() if released else None

@@ -7,6 +7,7 @@ disengages it then.
 
 A program that moves or resets the drives also holds a file lock, which the system releases when
 that program ends in any manner; this distinguishes an active run from the latch of an earlier one.
+The locked file contains the program's process ID.
 """
 
 from __future__ import annotations
@@ -90,15 +91,23 @@ class FaultLatch:
             cause = f"the latch file cannot be read: {why}"
             return LatchedFault(self._bus, _UNKNOWN, cause, _UNKNOWN, _UNKNOWN, 0, ())
 
-    def read_in_motion(self) -> tuple[LatchedFault | None, bool]:
-        """The latched fault, and whether it is that of an active motion, consistently."""
+    def read_in_motion(self) -> tuple[LatchedFault | None, int | None]:
+        """The latched fault, and the process that moves or resets the drives now, consistently.
+
+        Returns:
+            The fault, without that of the active motion, which is latched only if it ends badly,
+            and the process ID (0 if unknown); None for each that there is not.
+        """
         latched = self.read()
         while True:
-            in_motion = self.held_by_another()
+            holder = self.holder()
             again = self.read()
             if again == latched:
-                return latched, latched is not None and in_motion
+                break
             latched = again
+        if latched is None or holder is None:
+            return latched, None
+        return (None if holder in (0, latched.process) else latched), holder or latched.process
 
     def require_disengaged(self) -> None:
         """Requires the latch to be disengaged.
@@ -248,6 +257,9 @@ class FaultLatch:
         try:
             if not locked_within(lock, LOCK_TIMEOUT):
                 raise self._refusal(self.read())
+            with suppress(OSError):  # another user's file of an earlier version
+                os.truncate(lock, 0)
+                os.pwrite(lock, str(os.getpid()).encode(), 0)
         except BaseException:
             os.close(lock)
             raise
@@ -261,16 +273,23 @@ class FaultLatch:
 
     def held_by_another(self) -> bool:
         """Whether another program is moving or resetting the drives now."""
+        return self.holder() is not None
+
+    def holder(self) -> int | None:
+        """Process ID of another program that moves or resets the drives now; 0 if unknown."""
         if self._held is not None:
-            return False
+            return None
         try:
             lock = open_lock(self._lock)
         except FileNotFoundError:
-            return False
+            return None
         except OSError as error:
             raise self._not_kept(error.strerror) from None
         try:
-            return not locked_within(lock, 0.0, fcntl.LOCK_SH)
+            if locked_within(lock, 0.0, fcntl.LOCK_SH):
+                return None
+            text = os.pread(lock, 20, 0)
+            return int(text) if text.isdigit() else 0
         finally:
             os.close(lock)
 
@@ -287,8 +306,10 @@ class FaultLatch:
             raise self._not_kept(error.why) from None
 
     def _refusal(self, latched: LatchedFault | None) -> Refused:
-        if latched is None or self.held_by_another():
-            who = "" if latched is None else f" (process {latched.process})"
+        holder = self.holder()
+        if latched is None or holder is not None:
+            process = holder or (latched.process if latched else 0)
+            who = f" (process {process})" if process else ""
             return Refused(
                 f"a motion or a reset{who} is in progress on this bus",
                 where=f"bus {self._bus}",

@@ -1,7 +1,8 @@
 """State folder with the latch and reference of each bus, and locks on its files.
 
 One folder for all users if an administrator created it, else one per user: a fault of one user's
-run is then unknown to others. Files are named after the canonical name of the bus.
+run is then unknown to others. Files are named after the canonical name of the bus, those of a
+serial adapter after itself: the number of its device changes when it is plugged in again.
 """
 
 from __future__ import annotations
@@ -17,10 +18,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
-from model.errors import Refused
+from model.errors import HardwareMissing, Refused
 
 #: Used by all users if it exists: ``sudo install -d -m 2775 -g GROUP /var/lib/cdpr``.
 SHARED = Path("/var/lib/cdpr")
+#: Serial devices of this computer, and what they belong to. Source: Linux, sysfs-class-tty.
+DEVICES = Path("/sys/class/tty")
 #: A latch, or a reference of many cables, has a few kilobytes.
 LARGEST_FILE = 65_536
 
@@ -56,11 +59,47 @@ def state_folders() -> tuple[Path, ...]:
 
 
 def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
-    """The file of a kind, such as ``latched``, for a bus; then where it was before, if readable."""
-    name = re.sub(r"[^A-Za-z0-9.]+", "-", settings.canonical)
+    """The file of a kind, such as ``latched``, for a bus; then where it was before, if readable.
+
+    Raises:
+        HardwareMissing: The bus is that of a serial adapter which is not there, so that it is
+            unknown which one it is.
+    """
+    interface, channel = settings.canonical.split(" ", 1)
+    if channel.startswith("/"):
+        channel = _serial_adapter(Path(channel))
+    name = re.sub(r"[^A-Za-z0-9.]+", "-", f"{interface} {channel}")
     first, *earlier = state_folders()
     readable = [folder for folder in earlier if os.access(folder, os.R_OK | os.X_OK)]
     return tuple(folder / f"{kind}-{name}.json" for folder in (first, *readable))
+
+
+def _serial_adapter(device: Path) -> str:
+    """A name that an adapter keeps, whatever the number of its device.
+
+    USB adapters are known by their serial number, those without by the port they are plugged into;
+    other devices are fixed to the computer. Source: Linux, sysfs-bus-usb.
+    """
+    if not device.exists():
+        raise HardwareMissing(
+            f"there is no serial adapter {device}",
+            where="bus.channel",
+            why="it is unplugged, or has another name since it was plugged in again; its latched"
+            " fault and homing reference are filed under the adapter, so they are unknown",
+            next_step="plug it in, and name it as in `ls /dev/serial/by-id`, which stays the same",
+        )
+    unit = (DEVICES / device.name / "device").resolve()
+    usb = next((folder for folder in unit.parents if (folder / "idVendor").exists()), None)
+    if usb is None:
+        return str(device)
+    interface = unit.relative_to(usb).parts[0].partition(":")[2]
+    unit_of = [interface, *(path.read_text().strip() for path in unit.glob("port_number"))]
+    if (usb / "serial").exists():
+        names = [(usb / name).read_text().strip() for name in ("idVendor", "idProduct", "serial")]
+    else:
+        controller = next(folder.parent for folder in usb.parents if folder.name.startswith("usb"))
+        names = [str(controller), usb.name.partition("-")[2]]  # without the number of its bus
+    return " ".join(["usb", *names, *unit_of])
 
 
 def state_file(kind: str, settings: BusSettings) -> Path:

@@ -31,7 +31,7 @@ from executor.remote.command_socket import advertised_ahead, is_stopped_since
 from executor.remote.protocol import StatusSource, answer_to, status_answer
 from executor.remote.status import NO_PATH, MotionStatus
 from executor.supervision import LocalRequests, RequestBoard, Supervisor
-from model.errors import StoppedByOperator, require_child_processes
+from model.errors import CdprError, StoppedByOperator, require_child_processes
 from model.rig import Rig
 
 #: Largest length of a request, [bytes].
@@ -246,12 +246,12 @@ class Commands:
 
     @contextmanager
     def during_motion(
-        self, status: StatusSource, presses: PressBoard | None = None
+        self, status: MotionStatus, presses: PressBoard | None = None
     ) -> Iterator[None]:
         """From the opening of devices to the end of the motion, after which no request is taken.
 
         Args:
-            status: Reported in answers.
+            status: Reported in answers; takes an error of the block.
             presses: Of a jog session; None for any other motion.
 
         Raises:
@@ -263,6 +263,9 @@ class Commands:
             self._advertise()
             self.require_no_stop()
             yield
+        except CdprError as error:
+            status.take_error(error)
+            raise
         finally:
             self._end()
 

@@ -240,6 +240,7 @@ def record_stop() -> None:
                 _remove(folder, name)
                 flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
                 with os.fdopen(os.open(name, flags, 0o644, dir_fd=folder), "wb") as stream:
+                    os.fchmod(stream.fileno(), 0o644)  # root's, whatever its umask: users read it
                     stream.write(line)
                 os.rename(name, _STOPPED, src_dir_fd=folder, dst_dir_fd=folder)
 

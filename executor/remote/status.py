@@ -16,15 +16,15 @@ row by row), ``stated`` (whether it includes the errors common to all images), `
 that of the cable), ``in_fault``, ``position_counts``, ``set_counts``, ``tension_n``}], ``events``
 [{``time_s``, ``code``, ``text``}], the newest last. An unknown number is null; before the first
 cycle ``state`` is ``preparing`` (``releasing`` during `cdpr release`) and ``drives`` is empty;
-before a motion opens its devices there is also ``verb``, the verb that is being prepared; at
-the end ``cause`` is the reason of a bad end. Winches that move without a path (`cdpr home`, `cdpr
-jog --cable`) have no ``path_mm`` and ``path_length_mm``; their ``row`` of 100 ``rows`` is a
-percentage. A jog session has ``jog`` {``speed_mm_s`` (largest), ``position_mm``, ``quaternion``
-(commanded pose), ``room_mm`` (to the end of the checked line), ``limit`` (why it ends there, or
-null)}, and neither rows nor a path; a session of single cables has ``cable_jog`` {``speed_mm_s``
-(largest), ``limit_n`` (of every tension), ``cable`` (that moved last, or null), ``press_mm`` (paid
-out by the latest press; negative for wound in), ``session_mm`` (the same for each cable since the
-session began), ``limit`` (why the cable stops, or null)}.
+before a motion opens its devices there is also ``verb``, the verb that is being prepared; at the
+end ``cause`` is the reason of a bad end, also where the motion did not begin. Winches that move
+without a path (`cdpr home`, `cdpr jog --cable`) have no ``path_mm`` and ``path_length_mm``; their
+``row`` of 100 ``rows`` is a percentage. A jog session has ``jog`` {``speed_mm_s`` (largest),
+``position_mm``, ``quaternion`` (commanded pose), ``room_mm`` (to the end of the checked line),
+``limit`` (why it ends there, or null)}, and neither rows nor a path; a session of single cables has
+``cable_jog`` {``speed_mm_s`` (largest), ``limit_n`` (of every tension), ``cable`` (that moved last,
+or null), ``press_mm`` (paid out by the latest press; negative for wound in), ``session_mm`` (the
+same for each cable since the session began), ``limit`` (why the cable stops, or null)}.
 """
 
 from __future__ import annotations
@@ -38,11 +38,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from drivers.can_bus import BusSettings
 from drivers.factory import drive_flags, drive_states
 from executor.recording.run_folder import RunEvent
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import RequestBoard
 from executor.trajectory.setpoints import PreparedRun
+from model.errors import CdprError, StoppedByOperator
 from model.rig import Rig
 from tracking.clearance import MeasuredClearance
 from tracking.measurement import PoseMeasurement
@@ -53,6 +55,7 @@ if TYPE_CHECKING:
 
 #: Number of newest events reported.
 EVENTS_SHOWN = 12
+_RELEASING = "releasing"
 
 
 class CyclesSoFar:
@@ -66,7 +69,7 @@ class CyclesSoFar:
         self._rig, self._simulated_time = rig, simulated_time
         self._worst_lateness = 0.0
         self._lost = 0
-        self._end: tuple[State, str] | None = None
+        self._end: tuple[State | None, str] | None = None
         self.before = "preparing"
         """State reported before the first cycle."""
 
@@ -81,6 +84,12 @@ class CyclesSoFar:
     def take_end(self, state: State, cause: str) -> None:
         """Takes the end of the motion, which replaces the state."""
         self._end = state, cause
+
+    def take_error(self, error: CdprError) -> None:
+        """Takes an error of the verb; before its motion began it latches nothing."""
+        if self._end is None and self.last is None:
+            state = State.STOPPED if isinstance(error, StoppedByOperator) else None
+            self._end = State.LATCHED if self.before == _RELEASING else state, error.what
 
     def as_dict(self) -> dict[str, Any]:
         """State, times, replies and drives; see the module docstring."""
@@ -139,9 +148,8 @@ class CyclesSoFar:
 
 
 def bus_name(rig: Rig) -> str:
-    """The bus of a rig, as in a status."""
-    bus = rig.document.bus
-    return f"{bus.interface} {bus.channel}".strip()
+    """The bus of a rig, as in a status; the same text for every spelling in rig files."""
+    return BusSettings.of(rig).canonical.strip()
 
 
 def identity(rig: Rig, folder: Path | None) -> dict[str, Any]:
@@ -201,11 +209,15 @@ class MotionStatus(ABC):
 
     def take_release(self) -> None:
         """Reports a release, in which nothing moves and no cycle is reported."""
-        self._cycles.before = "releasing"
+        self._cycles.before = _RELEASING
 
     def take_end(self, state: State, cause: str) -> None:
         """Takes the end of the motion."""
         self._cycles.take_end(state, cause)
+
+    def take_error(self, error: CdprError) -> None:
+        """Takes an error that ended the verb; see `CyclesSoFar.take_error`."""
+        self._cycles.take_error(error)
 
     def as_dict(self) -> dict[str, Any]:
         """See the module docstring."""

@@ -16,15 +16,24 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import can
 import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
 from drivers import can_bus
 from drivers.cameras import live as cameras
-from drivers.can_bus import BusSettings, KernelInterface, can_interfaces, parse_interfaces
+from drivers.can_bus import (
+    BusSettings,
+    KernelInterface,
+    can_interfaces,
+    open_bus,
+    parse_interfaces,
+)
 from executor import doctor
-from executor.doctor import MachineCheck, kernel_bus, memory_check, priority_check
+from executor.doctor import MachineCheck, kernel_bus, memory_check, priority_check, rig_bus
+from executor.interlock import locks
+from executor.interlock.locks import SetUpLock
 from model.rig import load_rig
 from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.plans import RIG
@@ -236,6 +245,29 @@ def with_profile(tmp_path: Path, profile: str) -> Path:
     rig = tmp_path / "rig.yaml"
     rig.write_text(f"{RIG.read_text()}drives: {{type: cia402, profile: {profile}}}\n")
     return rig
+
+
+def test_a_bus_that_another_program_uses_is_not_opened(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Opening a serial adapter sets its bit rate, which closes the channel of the other program."""
+    monkeypatch.setattr(locks, "SHARED", tmp_path / "absent")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    rig = load_rig(RIG).with_bus("udp_multicast", "239.74.163.66")
+    opened: list[BusSettings] = []
+
+    def note(settings: BusSettings) -> can.BusABC:
+        opened.append(settings)
+        return open_bus(BusSettings("virtual", "instead"))
+
+    monkeypatch.setattr("drivers.can_bus.open_bus", note)
+    with SetUpLock(BusSettings.of(rig)).held():
+        checks = {check.name: check for check in rig_bus(rig)}
+    assert opened == []
+    used = checks["bus udp_multicast 239.74.163.66"]
+    assert (used.good, used.text) == (True, "in use by another program, not opened")
+    assert "opens" in [check.text for check in rig_bus(rig)]
+    assert len(opened) == 1
 
 
 def test_objects_of_all_drives_are_read_in_one_table(tmp_path: Path) -> None:

@@ -168,6 +168,22 @@ def test_a_key_that_waited_while_the_program_paused_begins_no_press(
     assert [counts[0] > 0, *(b > a for a, b in pairwise(counts))] == [True, True, False, True]
 
 
+@pytest.mark.parametrize(("rigs", "asked", "shown"), [(10, 20, 10.0), (50, 20, 20.0)])
+def test_the_speed_that_is_shown_is_that_of_the_session(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rigs: int, asked: int, shown: float
+) -> None:
+    rig = tmp_path / "rig.yaml"
+    text = RIG.read_text()
+    assert text.count(" speed_mm_s: 20") == 1
+    rig.write_text(text.replace(" speed_mm_s: 20", f" speed_mm_s: {rigs}"))
+    speeds: list[float] = []
+    monkeypatch.setattr(jog, "Keys", Mock())
+    monkeypatch.setattr(jog, "JogKeys", lambda _keys, speed: speeds.append(speed))
+    monkeypatch.setattr(jog, "_hold_to_run", lambda *_: None)
+    assert call("jog", rig, "--keys", "--no-scene", "--speed-mm-s", asked).code == 0
+    assert speeds == pytest.approx([shown])
+
+
 def test_space_stops_the_session_while_it_moves() -> None:
     with pytest.raises(StoppedByOperator):
         jogged([(1.0, 9.0, "right"), (1.5, 1.51, " ")])

@@ -147,20 +147,21 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
     assert replace(lost, run=17).next_step(rig) == ""
 
 
-def test_status_names_who_prepares_a_motion(
+def test_status_names_who_prepares_a_motion_and_does_not_read_its_drives(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also while it waits for the operator's answer, and its drives are free."""
     for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
     monkeypatch.setattr(service, "open_bus", lambda _: pytest.fail("the bus is opened"))
-    monkeypatch.setattr(SetUpLock, "tried", lambda _: nullcontext(False))
     rig = load_rig(CONFIGS / "gachon_8_6.yaml").with_bus("udp_multicast", "239.74.9.10")
     for channel, who in (("239.74.9.10", (os.getpid(),)), ("239.74.9.11", ())):
-        other = rig.with_bus("udp_multicast", channel)
+        other, is_free = rig.with_bus("udp_multicast", channel), bool(who)
+        monkeypatch.setattr(SetUpLock, "tried", lambda _, free=is_free: nullcontext(free))
         with commands_from_start("run", other, Supervisor(), realtime=False):
             result = service.status(rig)
-        assert (result.run, result.preparing) == (None, who)
+        assert (result.run, result.preparing, result.being_set_up) == (None, who, True)
         said = [text for name, text in result.facts(Path("rig.yaml")) if name == "motion"]
         assert said == [f"process {n} is preparing one; `cdpr stop` cancels it" for n in who]
 

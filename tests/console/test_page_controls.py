@@ -84,6 +84,12 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
         {"busy": {"verb": "home", "text": ""}, "motion": moving("moving")},
         ALWAYS | TAUGHT | {"hold", "speed"},
     ),
+    ("loading", {"busy": {"verb": "load", "text": ""}}, ALWAYS | TAUGHT),
+    (
+        "loading during a run of a terminal",
+        {"busy": {"verb": "load", "text": ""}, "motion": moving("moving")},
+        ALWAYS | TAUGHT | {"hold", "speed"},
+    ),
     ("preparing", {"busy": RUN, "motion": moving("preparing")}, ALWAYS | TAUGHT),
     ("moving", {"busy": RUN, "motion": moving("moving")}, ALWAYS | TAUGHT | {"hold", "speed"}),
     ("moved by another program", {"motion": moving("moving")}, ALWAYS | TAUGHT | {"hold", "speed"}),

@@ -31,10 +31,17 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from cdpr.cli.operate.run import show
-from cdpr.console import server
-from cdpr.console.commands import MOST_WAITING, Held, LetGo, Seen, parse_message
+from cdpr.console import server, session, view
+from cdpr.console.commands import (
+    MOST_WAITING,
+    Held,
+    LetGo,
+    PlainCommand,
+    Seen,
+    parse_message,
+)
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
-from cdpr.console.session import Console
+from cdpr.console.session import LONGEST_WAIT, Console
 from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
 from cdpr.console.verbs import (
     ConsoleFiles,
@@ -43,21 +50,22 @@ from cdpr.console.verbs import (
     _without_commands,
     outcome_state,
 )
+from cdpr.console.view import preview
 from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
 from executor.interlock.fault_latch import FaultLatch
-from executor.remote.client import stop_runs
+from executor.remote.client import preparations, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.command_socket import advertised
-from executor.remote.status import bus_name
+from executor.remote.status import bus_name, identity
 from executor.run_result import RunResult
 from executor.state_machine import State
 from executor.supervision import LocalRequests, Supervisor
 from model.errors import BadInput, Refused
-from model.plan import load_plan, save_plan
+from model.plan import Plan, load_plan, save_plan
 from model.pose import Pose
-from model.rig import load_rig
+from model.rig import Rig, load_rig
 from model.scene import load_scene
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, write_short_plan
 from tests.cli.program import call
@@ -646,14 +654,96 @@ def test_stop_waits_for_no_other_command_of_any_page(
         load = {"kind": "command", "id": 1, "command": "load_plan", "file": "short.json"}
         me.send(json.dumps(load))
         assert begun.wait(60)
-        for page in pages[1:]:  # they wait in turn, in threads of the server
-            page.send(json.dumps(load))
+        for page in pages[1:]:  # without control they do not wait
+            assert answer_to(page, json.dumps(load))["what"] == "take control first"
         for page in (me, pages[-1]):
             answer = command(page, "stop")
             assert (answer["to"], answer["what"]) == (7, "nothing moves")
         for _ in range(2 * MOST_WAITING):
             me.send(json.dumps(load))
-        assert "not finished yet" in command(me, "hold")["what"]
+        assert "not finished yet" in command(me, "home")["what"]
+
+
+@contextmanager
+def loading(
+    served: Served, page: ClientConnection, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[threading.Event]:
+    """A plan is being loaded by a page with control, until the event is set."""
+    begun, go_on = threading.Event(), threading.Event()
+
+    def check_slowly(path: Path, plan: Plan, rig: Rig) -> dict[str, Any]:
+        begun.set()
+        go_on.wait(60)
+        return preview(path, plan, rig)
+
+    monkeypatch.setattr(view, "preview", check_slowly)
+    assert command(page, "take_control")["ok"]
+    load = {"kind": "command", "id": 1, "command": "load_plan", "file": "short.json"}
+    page.send(json.dumps(load))
+    assert begun.wait(60)
+    try:
+        yield go_on
+    finally:
+        go_on.set()
+
+
+def test_a_run_is_held_resumed_and_slowed_down_while_a_plan_is_being_loaded(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The run may be that of a terminal; a long plan is checked for minutes."""
+    with served.page() as page, loading(served, page, monkeypatch):
+        for name, values in (("hold", {}), ("resume", {}), ("speed", {"percent": 30})):
+            assert command(page, name, **values)["ok"]
+            assert served.said[-1] == (name, values)
+        assert state(page)["busy"] == {"verb": "load", "text": "short.json"}
+
+
+@pytest.mark.parametrize("name", ["home", "release", "jog_begin", "run", "reset", "plan"])
+def test_a_command_that_waited_too_long_is_not_begun(
+    served: Served, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its page has reported that it got no answer: no one expects a motion any more."""
+    values = {"run": {"plan": "hash"}, "reset": {"cause": None}, "plan": {"scene": "s.yaml"}}
+    clock = time.clock_gettime
+    with served.page() as page, loading(served, page, monkeypatch) as go_on:
+        asked = {"kind": "command", "id": 2, "command": name, **values.get(name, {})}
+        page.send(json.dumps(asked))
+        assert command(page, "hold")["ok"], "by then the command has arrived"
+        monkeypatch.setattr(time, "clock_gettime", lambda which: clock(which) + LONGEST_WAIT)
+        go_on.set()
+        while (answer := receive(page)).get("to") != 2:
+            pass
+        assert (answer["ok"], "was not begun" in answer["what"]) == (False, True)
+        assert served.started == []
+        assert state(page)["busy"] is None
+        assert command(page, "home")["ok"]
+        assert [verb for verb, _ in served.started] == ["home"]
+
+
+def test_a_command_does_not_wait_long_for_one_of_another_thread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Such as the loading of a plan that was made here, or a reading of the drives."""
+    monkeypatch.setattr(session, "LONGEST_WAIT", 0.01)
+    served = Served()
+    page = served.console.control.join("test")
+    served.console.control.take(page, moving=False)
+    home = PlainCommand(kind="command", command="home")
+    held, go_on = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with served.console._one_at_a_time:
+            held.set()
+            go_on.wait(60)
+
+    other = threading.Thread(target=work)
+    other.start()
+    assert held.wait(60)
+    answer = served.console.command(page, home, arrived_now())
+    go_on.set()
+    other.join()
+    assert (answer, served.started) == ("another command is not finished yet", [])
+    served.console.close()
 
 
 @pytest.mark.parametrize(
@@ -741,6 +831,38 @@ def test_a_run_that_waits_for_its_drives_begins_only_if_it_is_still_wanted(
     console.close()
 
 
+@pytest.mark.parametrize("change", ["edit", "remove", "calibrate", "touch"])
+def test_no_verb_is_started_for_another_robot_than_the_page_shows(
+    tmp_path: Path, change: str
+) -> None:
+    """After an edit of the rig file homing succeeded, and the page said "Not homed" for ever."""
+    rig, result = tmp_path / "rig.yaml", tmp_path / "result.yaml"
+    rig.write_bytes(RIG.read_bytes())
+    result.write_text("the result")
+    calibration = ("--calibration", str(result))
+    console = Console(ConsoleFiles(rig, load_rig(RIG), (), calibration, (), None, True, False))
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    changes: dict[str, Callable[[], object]] = {
+        "edit": lambda: rig.write_text(rig.read_text().replace("gachon_8_6", "another")),
+        "remove": rig.unlink,
+        "calibrate": lambda: result.write_text("another"),
+        "touch": rig.touch,
+    }
+    changes[change]()
+    started: list[str] = []
+    console.verbs._start = lambda verb, _: started.append(verb)  # type: ignore[method-assign]
+    why_not = console.command(page, PlainCommand(kind="command", command="home"), arrived_now())
+    if change == "touch":
+        assert (why_not, started) == ("", ["home"])
+    else:
+        name = result if change == "calibrate" else rig
+        assert started == []
+        assert f"{name} changed since the console began" in why_not
+        assert "restart the console" in why_not
+    console.close()
+
+
 def test_a_stop_finds_each_verb_either_started_or_refused() -> None:
     """It waits for a start that has passed the check, and ends what was started."""
     console = Served().console
@@ -796,6 +918,26 @@ def test_no_verb_is_started_while_a_run_may_move_the_robot() -> None:
             assert [asked("service_begin"), asked("service_end"), asked("reset")] == [""] * 3
     assert [verb for verb, _ in served.started] == ["reset"] * 2
     console.close()
+
+
+@pytest.mark.parametrize("kind", ["udp_multicast", "slcan"])
+def test_a_motion_is_found_however_its_rig_file_spells_the_bus(tmp_path: Path, kind: str) -> None:
+    (tmp_path / "ttyACM0").touch()
+    (tmp_path / "by-id").symlink_to(tmp_path / "ttyACM0")
+    names = {
+        "udp_multicast": ("239.74.163.67", "239.74.163.67:43113"),
+        "slcan": (str(tmp_path / "ttyACM0"), str(tmp_path / "by-id")),
+    }
+    here, there = (load_rig(RIG).with_bus(kind, name) for name in names[kind])
+    watch = RunWatch(bus_name(here))
+    with commands_from_start("run", there, Supervisor(), realtime=False) as ahead:
+        assert [one["process"] for one in preparations(bus_name(here))] == [os.getpid()]
+        assert watch.why_busy() == "a motion is being prepared; wait, or stop it"
+        moving: Any = SimpleNamespace(as_dict=lambda: {**identity(there, None), "state": "moving"})
+        with ahead.during_motion(moving):
+            assert watch.update().status is not None
+            assert watch.why_busy() == "the robot moves; wait, or stop it"
+    watch.close()
 
 
 def test_a_motion_prepared_elsewhere_is_shown_and_gives_way_to_a_run() -> None:
@@ -938,6 +1080,10 @@ def test_a_reset_of_this_user_is_no_motion_of_another(monkeypatch: pytest.Monkey
     with monkeypatch.context() as patch:
         patch.setattr(os, "getpid", lambda: 2**30)  # of no process
         latch.engage(console.rig.name, Path("runs/mine"))
+    latch.let_go()
+    shown = latch.read()
+    assert shown is not None
+    latch.hold_engaged(shown)
     require_only_latched(console, "did not finish")
     latch.let_go()
     latch.disengage()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import errno
+import json
 import os
 import stat
 from pathlib import Path
@@ -11,10 +12,13 @@ from pathlib import Path
 import pytest
 
 from drivers.can_bus import BusSettings
+from executor import service
 from executor.interlock import fault_latch, locks
 from executor.interlock.fault_latch import FaultLatch
 from executor.state_machine import State
 from model.errors import BadInput, Fault, HardwareMissing, Refused, StoppedByOperator
+from model.rig import load_rig
+from tests.cli.plans import RIG
 
 BUS = BusSettings("udp_multicast", "239.74.163.62")
 
@@ -93,6 +97,27 @@ def test_a_reset_keeps_runs_off_the_bus_and_ends_disengaged(folder: Path) -> Non
         assert other.read() is not None, "latched to its end"
     assert other.read() is None
     assert not other.held_by_another()
+
+
+def test_during_a_reset_the_fault_stays_and_the_process_is_that_of_the_reset(folder: Path) -> None:
+    """It was that of the run, which may be long gone, and no fault was latched."""
+    mine, other = two()
+    mine.engage("gachon_8_6", folder)
+    assert other.read_in_motion() == (None, os.getpid()), "its fault is latched if it ends badly"
+    mine.settle("gachon_8_6", State.LATCHED, "a drive failed", folder)
+    latched = mine.read()
+    assert latched is not None
+    gone = dataclasses.replace(latched, process=2**22 + 1)
+    mine.path.write_text(json.dumps(dataclasses.asdict(gone)))
+    assert other.read_in_motion() == (gone, None)
+    rig = load_rig(RIG).with_bus(BUS.interface, BUS.channel)
+    with mine.held_for_reset("gachon_8_6", gone):
+        assert other.read_in_motion() == (gone, os.getpid())
+        with pytest.raises(Refused, match=rf"\(process {os.getpid()}\) is in progress"):
+            other.require_no_run()
+        seen = service.status(rig)
+        assert (seen.latched, seen.run, seen.drives) == ("a drive failed", os.getpid(), None)
+        assert f"a drive failed; process {os.getpid()} is" in dict(seen.facts())["latched fault"]
 
 
 REFUSED = [Refused("other drives hold"), BadInput("no rig"), StoppedByOperator("stopped")]

@@ -479,7 +479,7 @@ def test_a_release_whose_end_cannot_be_read_is_latched_with_its_cause_and_braked
             raise BusDown("the interface is down", "can0")
 
     with pytest.raises(BusDown, match="interface is down"):
-        release_drives(rig, interlock, Unplugged(), lambda _denied: None)
+        release_drives(rig, interlock, Unplugged(), lambda _denied: None, lambda: None)
     with pytest.raises(Refused, match=r"while releasing the drives: .*interface is down"):
         interlock.require_free()
     MotionInterlock(rig).found_released((), ALL)  # as a reset finds them

@@ -11,23 +11,26 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
+from cdpr.cli.operate.monitor import _show_end
 from cdpr.cli.operate.supervision import STOP_SIGNALS, stop_requests
 from executor import homing, jogging, runner, service
 from executor.hold_to_run import session
 from executor.remote import command_socket
-from executor.remote.client import StopResult, ask_all, stop_runs
+from executor.remote.client import StopResult, ask_all, final_status, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_socket import advertised, find_runs, is_stopped_since, record_stop
+from executor.remote.status import WinchStatus
 from executor.supervision import LocalRequests, OperatorRequests, Supervisor
 from model.errors import Refused, StoppedByOperator
 from model.rig import load_rig
@@ -360,14 +363,42 @@ def test_a_stop_during_the_preparation_stays_and_interrupts_the_program_once(fol
     interrupted: list[bool] = []
     supervisor = Supervisor()
     supervisor.on_early_stop = lambda: interrupted.append(True)  # type: ignore[method-assign]
-    moving: Any = SimpleNamespace(as_dict=dict)
     with commands_from_start("run", RIG, supervisor, realtime=False) as commands:
         for _ in range(2):
             assert stop_runs().stopped == (os.getpid(),)
         assert interrupted == [True]
-        begun = commands.during_motion(moving)
+        begun = commands.during_motion(WinchStatus(RIG, commands.board, simulated_time=True))
         with pytest.raises(StoppedByOperator, match="before anything moved"):
             begun.__enter__()
+
+
+ERRORS = [StoppedByOperator("stopped before anything moved"), Refused("a drive is in fault")]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("is_begun", [False, True])
+def test_what_ends_before_it_began_is_not_reported_as_latched(folders, error, is_begun):
+    """A release that was stopped while its drives were opened; nothing was latched."""
+    with ExitStack() as follow:
+        with (
+            suppress(type(error)),
+            commands_from_start("release", RIG, Supervisor(), realtime=False) as commands,
+        ):
+            status = WinchStatus(RIG, commands.board, simulated_time=False)
+            with commands.during_motion(status):
+                (run,) = follow.enter_context(find_runs())
+                assert ask_all([run], "status")[0].status is not None
+                if is_begun:
+                    status.take_release()
+                raise error
+        last = final_status(run)
+    assert last is not None
+    assert last["cause"] == error.what
+    ended = "latched" if is_begun else "stopped" if error is ERRORS[0] else "preparing"
+    assert last["state"] == ended
+    with pytest.raises(typer.Exit) as code:
+        _show_end(last, as_json=False)
+    assert code.value.exit_code == (130 if ended == "stopped" else 1)
 
 
 def test_ctrl_c_by_a_stop_is_a_stop_and_ctrl_c_alone_is_ctrl_c(folders):
@@ -381,6 +412,16 @@ def test_ctrl_c_by_a_stop_is_a_stop_and_ctrl_c_alone_is_ctrl_c(folders):
         interrupted(True)
     with pytest.raises(KeyboardInterrupt):
         interrupted(False)
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o027, 0o077])
+def test_the_record_of_a_stop_by_root_can_be_read_by_users(folders, umask):
+    before = os.umask(umask)
+    try:
+        record_stop()
+    finally:
+        os.umask(before)
+    assert [(folder / "stopped").stat().st_mode & 0o777 for folder in folders] == [0o644] * 2
 
 
 @pytest.mark.parametrize("is_later", [True, False])

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import json
 import os
+import shutil
 import signal
 import socket
 from collections.abc import Callable, Iterator
@@ -19,10 +20,10 @@ from executor.interlock import locks as state_folder
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.locks import LARGEST_FILE, SetUpLock, read_state_file, state_file
-from executor.interlock.reference import ReferenceFile
+from executor.interlock.reference import ReferenceFile, as_in_the_file
 from executor.state_machine import State
 from model import jit as machine_code
-from model.errors import Refused
+from model.errors import HardwareMissing, Refused
 from model.rig import load_rig
 from tests.cli.plans import RIG
 from tests.cli.program import call
@@ -308,7 +309,90 @@ def test_a_serial_adapter_is_the_same_bus_by_each_of_its_names(tmp_path: Path) -
     by_id.symlink_to(device)
     for speed in ("", "@115200"):
         names = {BusSettings("slcan", f"{name}{speed}").canonical for name in (device, by_id)}
-        assert names == {f"slcan {device}{speed}"}
+        assert names == {f"slcan {device}"}
+
+
+class UsbAdapters:
+    """Serial adapters in folders like /dev and /sys of Linux."""
+
+    def __init__(self, root: Path) -> None:
+        self.dev, self.by_id, self.sys = root / "dev", root / "by-id", root / "sys"
+        for folder in (self.dev, self.by_id, self.sys / "class"):
+            folder.mkdir(parents=True)
+
+    def plug_in(self, device: str, port: str, serial: str | None, bus: int = 1) -> Path:
+        """Returns the name of the adapter, which is the same each time."""
+        name = f"{bus}-{port}"
+        usb = self.sys / "devices" / "pci0000:00" / "0000:00:14.0" / f"usb{bus}" / name
+        (usb / f"{name}:1.0").mkdir(parents=True)
+        (usb.parent / "serial").write_text("0000:00:14.0\n")  # of the hub in the computer
+        (usb.parent / "idVendor").write_text("1d6b\n")
+        (usb / "idVendor").write_text("1d50\n")
+        (usb / "idProduct").write_text("606f\n")
+        if serial is not None:
+            (usb / "serial").write_text(f"{serial}\n")
+        (self.dev / device).touch()
+        (self.sys / "class" / device).mkdir()
+        (self.sys / "class" / device / "device").symlink_to(usb / f"{name}:1.0")
+        link = self.by_id / f"usb-{serial or port}"
+        link.symlink_to(self.dev / device)
+        return link
+
+    def unplug_all(self) -> None:
+        shutil.rmtree(self.sys)
+        for path in (*self.dev.iterdir(), *self.by_id.iterdir()):
+            path.unlink()
+        (self.sys / "class").mkdir(parents=True)
+
+
+@pytest.fixture
+def adapters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> UsbAdapters:
+    adapters = UsbAdapters(tmp_path)
+    monkeypatch.setattr(state_folder, "DEVICES", adapters.sys / "class")
+    return adapters
+
+
+@pytest.mark.parametrize("serial", ["207C3", None])
+@pytest.mark.parametrize("spelled", ["device", "link"])
+def test_a_serial_adapter_keeps_latch_and_reference_when_it_gets_another_number(
+    adapters: UsbAdapters, serial: str | None, spelled: str, tmp_path: Path
+) -> None:
+    """Absolute encoders would move by the rig file without their reference."""
+    link = adapters.plug_in("ttyACM0", "4.2", serial)
+    before = BusSettings("slcan", f"{adapters.dev / 'ttyACM0'}@115200")
+    FaultLatch(before).engage("rig", tmp_path, "a cable broke")
+    lost = as_in_the_file(load_rig(RIG)).model_copy(update={"lost": "a cable broke"})
+    ReferenceFile(before).write(lost)
+    adapters.unplug_all()
+    for name in (adapters.dev / "ttyACM0", link):
+        with pytest.raises(HardwareMissing, match="no serial adapter"):
+            FaultLatch(BusSettings("slcan", str(name)))
+    adapters.plug_in("ttyACM0", "4.1", serial and "another")
+    adapters.plug_in("ttyACM1", "4.2", serial, bus=3)
+    now = BusSettings("slcan", str(link if spelled == "link" else adapters.dev / "ttyACM1"))
+    latched, reference = FaultLatch(now).read(), ReferenceFile(now).read()
+    assert latched is not None
+    assert latched.cause == "a cable broke"
+    assert reference is not None
+    assert reference.lost == "a cable broke"
+    other = BusSettings("slcan", str(adapters.dev / "ttyACM0"))
+    assert (FaultLatch(other).read(), ReferenceFile(other).read()) == (None, None)
+
+
+def test_two_channels_of_one_serial_adapter_are_two_buses(adapters: UsbAdapters) -> None:
+    adapters.plug_in("ttyUSB0", "1", "207C3")
+    unit = (adapters.sys / "class" / "ttyUSB0" / "device").resolve()
+    names = set()
+    for number in (0, 1):
+        (adapters.dev / f"ttyUSB{number}").touch()
+        (unit / f"ttyUSB{number}").mkdir()
+        (unit / f"ttyUSB{number}" / "port_number").write_text(f"{number}\n")
+        folder = adapters.sys / "class" / f"ttyUSB{number}"
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+        (folder / "device").symlink_to(unit / f"ttyUSB{number}")
+        names.add(FaultLatch(BusSettings("slcan", str(adapters.dev / f"ttyUSB{number}"))).path)
+    assert len(names) == 2
 
 
 @pytest.mark.parametrize("relative", ["state", "./state", "~/state", ""])

@@ -179,7 +179,7 @@ def jog(
     """
     the_rig = bus.rig(rig)
     require_own_time(the_rig, not drives.fast)
-    speed = speed_mm_s / 1000.0
+    speed = min(speed_mm_s / 1000.0, the_rig.motion.speed)
     path = given_options(distance) | given_options(surroundings) | {"--output": output}
     if cable is not None or mm is not None:
         why = "a single cable is moved without a path, and obstacles are not checked"

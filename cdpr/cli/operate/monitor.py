@@ -226,7 +226,9 @@ def _show_end(status: dict[str, Any], as_json: bool) -> None:
     """Shows how the run ended, and exits with its exit code."""
     state, cause = status["state"], status.get("cause")
     if not as_json:
-        if state not in _EXIT_CODES:
+        if state not in _EXIT_CODES and cause:
+            typer.echo(f"the run ended before it began: {cause}")
+        elif state not in _EXIT_CODES:
             typer.echo(f"the run ended without a final status; last state {state}")
         else:
             typer.echo(f"the run ended: {state}{f', {cause}' if cause else ''}")

@@ -7,7 +7,7 @@ import { capital, mark, write } from "./elements.js";
 
 const MOVING = ["enabling", "approaching", "moving", "holding", "stopping", "securing"];
 const ACTIVE = ["preparing", ...MOVING];
-const VERBS = { run: "A run is in progress", home: "Homing is in progress", reset: "A reset is in progress", release: "The drives are being released", plan: "Planning is in progress", jog: "Jogging is enabled: end it first" };
+const VERBS = { run: "A run is in progress", home: "Homing is in progress", reset: "A reset is in progress", release: "The drives are being released", plan: "Planning is in progress", jog: "Jogging is enabled: end it first", load: "A plan is being loaded" };
 
 export const isActive = (motion) => motion !== null && ACTIVE.includes(motion.state);
 /** STOP does not reach such a motion. */

@@ -11,6 +11,8 @@ the server rejected; `detail` gives the reason). */
 /** The page must report stale data within 0.5 s: less one frame and one state. */
 export const STALE_S = 0.45;
 const TICK_MS = 50, ANSWER_MS = 5000, RECONNECT_MS = [250, 500, 1000, 2000];
+/** Commands that may take minutes: the state names what is being loaded meanwhile. */
+const LONG = ["load_plan", "compare"];
 /** Largest difference in rate of two computers' clocks. */
 const DRIFT = 2e-4;
 /** States of a run whose own status must be fresh; in all others nothing moves. */
@@ -69,7 +71,7 @@ export class Connection extends EventTarget {
     return true;
   }
 
-  /** Sends a command; resolves to `{ok, what}`, also without an answer. */
+  /** Sends a command; resolves to `{ok, what}`, also without an answer; the server begins none that is older. */
   command(command, fields = {}) {
     const id = ++this.#id;
     return new Promise((resolve) => {
@@ -79,7 +81,7 @@ export class Connection extends EventTarget {
         this.#answers.delete(id);
         resolve(answer);
       };
-      const timer = setTimeout(() => give({ ok: false, what: `No answer to “${command}” within ${ANSWER_MS / 1000} s.` }), ANSWER_MS);
+      const timer = LONG.includes(command) ? 0 : setTimeout(() => give({ ok: false, what: `No answer to “${command}” within ${ANSWER_MS / 1000} s.` }), ANSWER_MS);
       this.#answers.set(id, give);
     });
   }

@@ -25,7 +25,7 @@ export const STATES = {
   stopping: "Stopping", securing: "Securing", finished: "Finished", stopped: "Stopped", latched: "Stopped by a fault", releasing: "Releasing",
 };
 
-const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Planning", jog: "Preparing to jog", reset: "Resetting", release: "Releasing" };
+const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Planning", jog: "Preparing to jog", reset: "Resetting", release: "Releasing", load: "Loading a plan" };
 
 /** Where values at rest come from: no run reports the drives, and they may be moved or lose power unnoticed. */
 function readText({ drives_read: read, tensions_n: tensions }) {

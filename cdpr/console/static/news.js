@@ -7,7 +7,7 @@ import { address } from "./connection.js";
 import { at, capital, link, write } from "./elements.js";
 import { STATES } from "./live.js";
 
-const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging" };
+const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", plan: "Planning", jog: "Jogging", load: "Loading" };
 const DISMISSED = "cdpr dismissed outcome";
 
 /** The line of a verb's output with the result: the last that is neither indented nor a report. */
