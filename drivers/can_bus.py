@@ -417,7 +417,7 @@ def _interface(link: dict[str, Any]) -> KernelInterface:
         kind=details.get("info_kind", "can"),
         up="UP" in link["flags"],
         queue=int(link.get("txqlen", 0)),
-        bitrate=data.get("bittiming", {}).get("bitrate"),
+        bitrate=data.get("bittiming", {}).get("bitrate") or data.get("bittiming_bitrate") or None,
         state=data.get("state", ""),
     )
 

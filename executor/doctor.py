@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -392,9 +393,9 @@ def stopping_text(rig: Rig) -> str:
     margin = rig.at(home).capacity_margin
     at_home = home.position[None], home.rotation[None]
     coasting = coasting_distance(rig, (), *at_home, margin, turns=False)
+    inertia = f"; its inertia adds {coasting * 1000:.2g} mm at home" if isfinite(coasting) else ""
     return (
         f"without the master, drives stop by {lost.noticed_by} after {lost.notice * 1000:.0f} ms:"
         f" up to {lost.distance * 1000:.1f} mm at {rig.motion.speed * 1000:g} mm/s,"
-        f" {lost.distance_turning * 1000:.1f} mm where the platform rotates; its inertia adds"
-        f" {coasting * 1000:.2g} mm at home"
+        f" {lost.distance_turning * 1000:.1f} mm where the platform rotates{inertia}"
     )

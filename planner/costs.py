@@ -21,13 +21,14 @@ from model import kinematics
 from model.kinematics import cables_exist, cables_to, structure_matrix_of
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
-from model.scene import Scene
+from model.scene import Load, Scene
 from model.statics import wrench_sets
 from model.statics.feasibility import WrenchBox, capacity_margin
-from model.statics.gravity import weight_wrench
+from model.statics.gravity import inertial_wrench, weight_wrench
 from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner import space
 from planner.kernels.jit import stored
+from planner.settings import MARGIN_RESERVE
 from planner.space import Lattice, corners_and_weights
 
 _SAMPLING = 0.010
@@ -186,6 +187,21 @@ def external_wrenches(rig: Rig, scene: Scene, rotation: Array) -> WrenchBox:
     load = scene.load
     weight = weight_wrench(rig, Pose(rig.home.position, rotation), load)
     return WrenchBox(weight, np.concatenate([load.force, load.moment]))
+
+
+def margin_reserve(rig: Rig, load: Load | None, *, turns: bool) -> float:
+    """Capacity margin that ends and edges must keep, [N].
+
+    What the check requires for the motion's acceleration is exceeded by half of the reserve for
+    proofs at least.
+
+    Args:
+        rig: The robot.
+        load: Payload; none when left out.
+        turns: Whether the search rotates the platform.
+    """
+    for_proofs = MARGIN_RESERVE * rig.max_tension
+    return max(for_proofs, inertial_wrench(rig, load, turns=turns) + for_proofs / 2.0)
 
 
 def capacity_margins(rig: Rig, scene: Scene, positions: Array, rotation: Array) -> Array:

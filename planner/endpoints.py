@@ -14,11 +14,12 @@ from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
 from model.statics.feasibility import limiting_cables
+from model.statics.gravity import inertial_wrench
 from model.statics.tension_distribution import remedy
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.check import NEAR_AXIS, least_axis_distance
+from planner.check import GENTLER, NEAR_AXIS, least_axis_distance
 from planner.check_report import CheckReport
-from planner.costs import capacity_margins, external_wrenches
+from planner.costs import capacity_margins, external_wrenches, margin_reserve
 from planner.path import LENGTH_ROUND_OFF
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
@@ -53,7 +54,7 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
             _require_in_workspace(rig, name, pose)
             _require_off_pulley_axes(rig, name, pose)
             _require_clear(scene, model, name, pose)
-            _require_holdable(rig, leg.scene, name, pose)
+            _require_holdable(rig, leg.scene, name, pose, turns=free_rotation)
 
 
 def require_feasible_length(scene: Scene, longest: float) -> None:
@@ -252,9 +253,9 @@ def _pair(near: Nearest) -> str:
     return f"{near.first} – {near.second}"
 
 
-def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
+def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose, *, turns: bool) -> None:
     margin = float(capacity_margins(rig, scene, pose.position[None, :], pose.rotation)[0])
-    reserve = MARGIN_RESERVE * rig.max_tension
+    reserve = margin_reserve(rig, scene.load, turns=turns)
     if margin >= reserve:
         return
     if not np.isfinite(margin):
@@ -273,13 +274,22 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose) -> None:
         rms_anchor_radius(rig.anchors),
     )
     has, needs, _ = distinct_figures((margin, reserve, 0.0), 2)
+    if 0.0 <= margin < inertial_wrench(rig, scene.load, turns=turns):
+        raise BadInput(
+            f"at the {name} the cables can hold the platform, but not accelerate it by its motion"
+            f" limits: the capacity margin is {has} N, required {needs} N",
+            where=f"scene {name}",
+            next_step=f"{GENTLER}, or move the {name} to a larger margin (`cdpr workspace` maps"
+            f" it), or {remedy(*binding)}",
+            values=values,
+        )
     if margin >= 0.0:
         raise BadInput(
             f"at the {name} the cables can hold the platform, but the capacity margin is"
             f" {has} N, less than the planner's reserve of {needs} N",
             where=f"scene {name}",
-            why=f"with less than {MARGIN_RESERVE:.1%} of max_tension_n, wrench feasibility between"
-            " poses is seldom proved",
+            why=f"with less than {MARGIN_RESERVE:.1%} of max_tension_n, or half of it beyond the"
+            " force of the motion's acceleration, feasibility between poses is seldom proved",
             next_step=f"move the {name} to a larger margin (`cdpr workspace` maps it),"
             f" {remedy(*binding)}, or give waypoints to `cdpr.plan_from_waypoints`, which keeps no"
             " reserve",

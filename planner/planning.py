@@ -351,7 +351,7 @@ def plan_from_waypoints(
         raise PlanRejected(
             report,
             where=f"waypoints for {rig.name} in {scene.name}",
-            next_step="change the waypoints; nothing has moved",
+            next_step=f"{report.cure or 'change the waypoints'}; nothing has moved",
         )
     positions = np.array([pose.position for pose in waypoints])
     kinematic = KinematicCost(rig, scene.start.rotation)

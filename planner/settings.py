@@ -25,9 +25,9 @@ ATTEMPT_WITH_ROOM = 0.25
 """Part of the iterations after which the rewiring mode no longer requires room for blends."""
 
 MARGIN_RESERVE = 0.002
-"""Capacity margin that ends and edges must keep, as part of the largest tension. The check requires
-none, but an edge is proved in intervals that shrink with its margin: on a robot with pulleys at a
-margin of 0.05 %, edges of 200 mm stay unproved even without a reserve."""
+"""Capacity margin that ends and edges must keep at least, as part of the largest tension; see
+`planner.costs.margin_reserve`. An edge is proved in intervals that shrink with its margin: on a
+robot with pulleys at a margin of 0.05 %, edges of 200 mm stay unproved even without a reserve."""
 
 IMPROVING_ITERATIONS = 500
 """Iterations of the rewiring mode after its first path. Source: measured on the paper's scenes;

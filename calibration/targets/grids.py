@@ -282,7 +282,7 @@ class TagGrid:
         require_fields(self)
         require_board(self.columns * self.rows >= 4, "a tag grid needs 4 tags")
         require_board(min(self.columns, self.rows) >= 1, "a tag grid needs a row and a column")
-        require_board(min(self.tag, self.gap) > 0.0, "tags, and gaps, must be larger than 0 mm")
+        require_board(self.tag > 0.0 and self.gap > 0.0, "tags, and gaps, must be larger than 0 mm")
         require_board(
             self.family in FAMILIES,
             f"unknown tag family {self.family!r}",

@@ -138,10 +138,10 @@ class LawMotion(MotionTask):
 
 
 def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:
-    """Requires that no drive would have to move beyond the limits it was configured with.
+    """Requires that no drive would have to move beyond where the workspace can need it.
 
     Raises:
-        Refused: A drive would stop at its limit, or take it as a fault.
+        Refused: A drive with position limits would stop at them, or take them as a fault.
     """
     winches = WinchMap(rig)
     for drive, (first, farthest) in enumerate(zip(*law.reach, strict=True)):
@@ -155,8 +155,8 @@ def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:
                 f"{name} would move by up to {travel:.4g} mm, {beyond / per_mm:.2g} mm beyond its"
                 " position limits",
                 where="winches",
-                why="at the assumed pose no pose in the workspace needs such a cable length; the"
-                " drive would stop at its limit (607Dh), or with a fault (8612h)",
+                why="at the assumed pose no pose in the workspace needs such a cable length; a"
+                " drive with position limits (607Dh) stops at them, or with a fault",
                 next_step="allow a shorter reach or length, or take a pose farther inside the"
                 " workspace box; nothing was enabled",
             )

@@ -17,11 +17,11 @@ from model.scene import Scene
 from planner.collision.edges import edge_clearance, in_workspace, obstacles_free
 from planner.collision.self_collision_regions import Robot
 from planner.collision.world import build_robot, build_world, is_open, self_edge_free
-from planner.costs import KinematicCost
+from planner.costs import KinematicCost, margin_reserve
 from planner.kernels.jit import inlined, kernel, leaf, stored
 from planner.kernels.primitives import Vector, along, minus, norm
 from planner.kernels.scene_arrays import World
-from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE, Weights
+from planner.settings import CLEARANCE_RESERVE, Weights
 from planner.space import Lattice, corners_and_weights
 from planner.wrench.capacity import LoadArrays, build_load, margins
 from planner.wrench.translation import Holding, box_held, build_holding, edge_held
@@ -219,7 +219,7 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
     load = build_load(rig, scene, rotation)
     lattice = kinematic.lattice
     key = [rig.plan_hash, scene.document.load.model_dump(mode="json"), rotation.tolist()]
-    reserve = MARGIN_RESERVE * rig.max_tension
+    reserve = margin_reserve(rig, scene.load, turns=False)
     cells = stored("holding", [*key, reserve], _CELLS, lambda: _proved_cells(world, load, reserve))
     holding = Holding(reserve, cells, bool(cells.all()))
     capacity = np.zeros(lattice.shape)

@@ -23,12 +23,11 @@ from planner.anytime_6d.connect import connect
 from planner.anytime_6d.local_search import Line, copied, line_length, measure, new_line, polish
 from planner.anytime_6d.problem import RotatingProblem, build_objective, move_length, set_weights
 from planner.collision.world import build_robot, build_world
-from planner.costs import KinematicCost
+from planner.costs import KinematicCost, margin_reserve
 from planner.edge_checks import REASONS
 from planner.path import LengthLimit, Progress, Route, smallest_gap
 from planner.settings import (
     CLEARANCE_RESERVE,
-    MARGIN_RESERVE,
     TurningSettings,
     Weights,
     least_rounds,
@@ -224,7 +223,7 @@ def rotating_problem(
         world=world,
         robot=build_robot(rig, world, scene.self_clearance + CLEARANCE_RESERVE),
         load=build_load(rig, scene, rotation),
-        reserve=MARGIN_RESERVE * rig.max_tension,
+        reserve=margin_reserve(rig, scene.load, turns=True),
         tilt=limits.tilt + _ROTATION_ROUND_OFF,
         turn=limits.turn + _ROTATION_ROUND_OFF,
         objective=build_objective(weights, kinematic),

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from model.rig import Rig
 from model.scene import Scene
 from planner.collision.self_collision_regions import Robot
-from planner.costs import KinematicCost
+from planner.costs import KinematicCost, margin_reserve
 from planner.edge_checks import FREE, REASONS, ExactChecks, edge_problem
 from planner.kernels.jit import kernel
 from planner.kernels.scene_arrays import World
@@ -31,7 +31,6 @@ from planner.rrt.sampling import (
     record_outcome,
 )
 from planner.rrt.tree import Tree, add, move, nearest, nodes_to, squared_distance, within
-from planner.settings import MARGIN_RESERVE
 from planner.wrench.capacity import LoadArrays
 from planner.wrench.translation import Holding
 
@@ -133,7 +132,7 @@ def exact_checks(rig: Rig, scene: Scene, rotation: Array, reserve: float) -> Exa
         rotation,
         obstacle_clearance=scene.obstacle_clearance + reserve,
         self_clearance=scene.self_clearance + reserve,
-        margin_reserve=MARGIN_RESERVE * rig.max_tension,
+        margin_reserve=margin_reserve(rig, scene.load, turns=False),
     )
 
 

@@ -13,7 +13,8 @@ import numpy as np
 
 from model.files.documents import write_atomic, write_bytes_atomic
 from model.scene import Scene
-from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
+from planner.costs import margin_reserve
+from planner.settings import CLEARANCE_RESERVE
 from planner.workspace.compute import Maps
 from planner.workspace.figures import (
     SPACE_LAYERS,
@@ -67,12 +68,14 @@ def write_maps(
 def _lead(question: Question) -> str:
     """First sentence of the page."""
     rig = question.rig
+    load = None if question.scene is None else question.scene.load
+    reserve = margin_reserve(rig, load, turns=False)
     rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
         f" {question.length * 1e3:.1f} mm in condition number and dexterity cost{rotated}. At"
         f" start, stops and goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity"
-        f" margin of {MARGIN_RESERVE * rig.max_tension:.3g} N beyond what is mapped as allowed."
+        f" margin of {reserve:.3g} N beyond what is mapped as allowed."
     )
 
 

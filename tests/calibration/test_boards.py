@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import replace
 from functools import cache
@@ -509,6 +510,7 @@ def test_a_number_that_is_seen_twice_is_left_out_by_name(board, number: int) -> 
         (lambda: Charuco(20, 20, 0.03, 0.02, "4X4_50"), "50 markers; the board needs 200"),
         (lambda: TagGrid(3, 1, 0.03, 0.01, "tag36h11"), "needs 4 tags"),
         (lambda: TagGrid(3, 2, 0.03, 0.0, "tag36h11"), "gap"),
+        (lambda: TagGrid(3, 2, 0.03, math.nan, "tag36h11"), "gap"),
         (lambda: TagGrid(3, 2, 0.03, 0.01, "tag99h1"), "unknown tag family"),
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", 580), "tags 0 to 586; .* 580 to 591"),
         (lambda: TagGrid(4, 3, 0.04, 0.012, "tag36h11", order="up"), "unknown order"),

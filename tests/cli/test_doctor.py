@@ -31,10 +31,17 @@ from drivers.can_bus import (
     parse_interfaces,
 )
 from executor import doctor
-from executor.doctor import MachineCheck, kernel_bus, memory_check, priority_check, rig_bus
+from executor.doctor import (
+    MachineCheck,
+    kernel_bus,
+    memory_check,
+    priority_check,
+    rig_bus,
+    stopping_text,
+)
 from executor.interlock import locks
 from executor.interlock.locks import SetUpLock
-from model.rig import load_rig
+from model.rig import load_rig, rig_from_document
 from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.plans import RIG
 from tests.cli.program import call
@@ -102,6 +109,12 @@ def test_a_healthy_interface_has_nothing_to_fix() -> None:
             "500000 bit/s; the rig file says 1000000",
             "sudo ip link set can0 down && sudo ip link set can0 up txqueuelen 128 type can"
             " bitrate 1000000",
+        ),
+        (  # a controller of fixed bit rates, such as slcan
+            {"linkinfo": {"info_kind": "can", "info_data": {"bittiming_bitrate": 250000}}},
+            "bit rate of can0",
+            "250000 bit/s; the rig file says 1000000",
+            "bitrate 1000000",
         ),
         (
             {"linkinfo": {"info_kind": "can", "info_data": {}}},
@@ -380,3 +393,12 @@ def test_a_user_without_a_name_is_named_by_number(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(KeyError):
         pwd.getpwuid(54321)
     assert "echo ':54321 - memlock unlimited'" in memory_check(65536, privileged=False).fix
+
+
+def test_a_platform_too_heavy_at_home_has_no_distance_by_inertia() -> None:
+    rig = load_rig(RIG)
+    heavy = rig.document.platform.model_copy(update={"mass_kg": 60.0})
+    assert "its inertia adds" in stopping_text(rig)
+    text = stopping_text(rig_from_document(rig.document.model_copy(update={"platform": heavy})))
+    assert "inertia" not in text
+    assert "inf" not in text

@@ -21,6 +21,7 @@ from model.rig import Rig, rig_from_document
 from model.scene import empty_scene
 from planner import planning
 from planner.check import verify
+from planner.check_report import PlanRejected
 from planner.costs import capacity_margins
 from planner.endpoints import require_usable_ends
 from planner.path import Route
@@ -211,7 +212,9 @@ def test_a_platform_too_light_below_its_outlets_is_not_advised_to_carry_less(
 
 
 def test_an_end_that_only_lacks_the_reserve_is_not_called_infeasible(gachon, scene_with) -> None:
-    """The check accepts such a path: tensions within the limits exist."""
+    """The check accepts such a path: tensions within the limits exist, and its motion is gentle."""
+    motion = gachon.document.motion.model_copy(update={"acceleration_mm_s2": 0.1})
+    gentle = rig_from_document(gachon.document.model_copy(update={"motion": motion}))
     reserve, low, high = MARGIN_RESERVE * gachon.max_tension, 0.0, 60.0
     ends = {"goal": {"position_mm": [0.0, 0.0, 446.0]}}
     margin = -np.inf
@@ -221,14 +224,21 @@ def test_an_end_that_only_lacks_the_reserve_is_not_called_infeasible(gachon, sce
         margin = capacity_margins(gachon, scene, scene.start.position[None, :], np.eye(3))[0]
         low, high = (payload, high) if margin > 0.8 * reserve else (low, payload)
     with pytest.raises(BadInput, match="start the cables can hold the platform") as caught:
-        make_plan(gachon, scene, OptimalSettings())
+        make_plan(gentle, scene, OptimalSettings())
     assert (
         f"{margin:.2f} N, less than the planner's reserve of {reserve:.2f} N" in caught.value.what
     )
     assert caught.value.values == pytest.approx({"margin_n": margin, "required_n": reserve})
     assert "outside" not in caught.value.why
-    own = plan_from_waypoints(gachon, scene, [scene.start, scene.goal])
+    own = plan_from_waypoints(gentle, scene, [scene.start, scene.goal])
     assert verify(own).report.proved_capacity_margin >= 0.0
+    with pytest.raises(BadInput, match="but not accelerate it by its motion limits") as caught:
+        make_plan(gachon, scene, OptimalSettings())
+    assert "acceleration_mm_s2" in caught.value.next_step
+    assert "plan_from_waypoints" not in caught.value.next_step
+    with pytest.raises(PlanRejected, match="cannot accelerate the platform") as rejected:
+        plan_from_waypoints(gachon, scene, [scene.start, scene.goal])
+    assert "acceleration_mm_s2" in rejected.value.next_step
 
 
 def test_cables_that_act_in_too_few_directions_are_named(

@@ -70,9 +70,11 @@ class Records:
         self.on_cycle(record)
 
 
-def mover(as_set_up: Rig, law: WinchLaw, group: DriveGroup, board: LocalRequests) -> WinchesHere:
+def mover(
+    counted: Rig, as_set_up: Rig, law: WinchLaw, group: DriveGroup, board: LocalRequests
+) -> WinchesHere:
     """A law in simulated time, on configured drives."""
-    drives = ReadyDrives(as_set_up, group, None, lambda _load: None, ())
+    drives = ReadyDrives(counted, group, None, lambda _load: None, ())
     limit, speed = as_set_up.max_tension, max(w.max_speed for w in as_set_up.winches)
     motion = LawMotion(as_set_up.cable_count, 0.01, lambda _rig, _counts: law, limit, speed)
     return WinchesHere(motion, drives, SimulatedClock(0.01), board)
@@ -85,6 +87,7 @@ class Bench:
     rig: Rig
     rehearsal: SimulatedCia402Rig
     group: DriveGroup
+    counted: Rig
     as_set_up: Rig
     counts: list[int]
     script: Callable[[Bench, int], None] = lambda _bench, _cycle: None
@@ -120,7 +123,7 @@ class Bench:
             self.take_event(event)
 
         return move_winches(
-            mover(self.as_set_up, law, self.group, self.board),
+            mover(self.counted, self.as_set_up, law, self.group, self.board),
             self.rig,
             self.interlock or MotionInterlock(self.rig),
             Records(on_cycle, on_event),
@@ -157,7 +160,7 @@ def after_power_loss(
         as_set_up = with_reduced_limits(counted, limit=limit, speed=speed)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=limit)
         group.configure()
-        yield Bench(rig, rehearsal, group, as_set_up, counts)
+        yield Bench(rig, rehearsal, group, counted, as_set_up, counts)
 
 
 def lost(seed: int, slack_mm: float = 3.0, *, on_a_stand: bool) -> PowerLoss:
@@ -750,7 +753,7 @@ def wound_in(rig: Rig, targets: Array, *, on_a_stand: bool) -> WinchResult:
         group.configure()
         law = PretensionLaw(limited, counts, targets=targets, limit=400.0, reach=0.05, speed=0.002)
         result = move_winches(
-            mover(limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
+            mover(counted, limited, law, group, LocalRequests()), rig, MotionInterlock(rig),
             Records(lambda _record: None, lambda _event: None),
             record=Path("nowhere"), rehome=True, at_rest=lambda _result, _true_pose: None,
         )  # fmt: skip

@@ -16,7 +16,7 @@ from planner.anytime.path import advance, handle_of
 from planner.anytime.problem import ASK_PROOF, LEAST_MARGIN, NO_MARGIN
 from planner.anytime.state import BEST, KEPT, new_search
 from planner.check import check_path
-from planner.costs import capacity_margins
+from planner.costs import capacity_margins, margin_reserve
 from planner.edge_checks import FREE, ExactChecks
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE, OBJECTIVES
 from tests.planner.anytime.scenes_of_the_search import (
@@ -164,7 +164,7 @@ def test_a_grid_of_margins_that_forbids_everything_is_soon_ignored(asked) -> Non
 def test_an_end_with_little_margin_is_left_without_proofs(hall, ready_scene) -> None:
     """Margins of the grid must be large on edges, but not larger than an end's own."""
     scene = ready_scene("hall_pillar")
-    reserve, low, high = MARGIN_RESERVE * hall.max_tension, 0.0, 600.0
+    reserve, low, high = margin_reserve(hall, scene.load, turns=False), 0.0, 600.0
     for _ in range(30):  # the force up to which three times the reserve is left at the start
         force = (low + high) / 2.0
         load = scene.document.load.model_copy(update={"force_n": [force] * 3})
