@@ -61,17 +61,23 @@ def state_folders() -> tuple[Path, ...]:
 def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
     """The file of a kind, such as ``latched``, for a bus; then where it was before, if readable.
 
+    Those of a serial adapter were named after its device, which may be another adapter's now: that
+    one is latched, too.
+
     Raises:
         HardwareMissing: The bus is that of a serial adapter which is not there, so that it is
             unknown which one it is.
     """
     interface, channel = settings.canonical.split(" ", 1)
-    if channel.startswith("/"):
-        channel = _serial_adapter(Path(channel))
-    name = re.sub(r"[^A-Za-z0-9.]+", "-", f"{interface} {channel}")
+    channels = [channel]
+    if channel.startswith("/"):  # after its device, where it was before, also with its speed
+        _, at, speed = settings.channel.strip().partition("@")
+        channels = [_serial_adapter(Path(channel)), channel, f"{channel}{at}{speed}"]
+    names = [re.sub(r"[^A-Za-z0-9.]+", "-", f"{interface} {one}") for one in channels]
     first, *earlier = state_folders()
-    readable = [folder for folder in earlier if os.access(folder, os.R_OK | os.X_OK)]
-    return tuple(folder / f"{kind}-{name}.json" for folder in (first, *readable))
+    folders = [first, *(one for one in earlier if os.access(one, os.R_OK | os.X_OK))]
+    files = [folder / f"{kind}-{name}.json" for name in names for folder in folders]
+    return tuple(dict.fromkeys(files))
 
 
 def _serial_adapter(device: Path) -> str:

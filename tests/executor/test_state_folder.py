@@ -379,6 +379,50 @@ def test_a_serial_adapter_keeps_latch_and_reference_when_it_gets_another_number(
     assert (FaultLatch(other).read(), ReferenceFile(other).read()) == (None, None)
 
 
+@pytest.mark.parametrize("speed", ["", "@115200"])
+@pytest.mark.parametrize("shares", [False, True])
+def test_a_serial_adapter_keeps_latch_and_reference_filed_under_its_device(
+    adapters: UsbAdapters,
+    speed: str,
+    shares: bool,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As they were before adapters were known by serial number; then the folder may change, too."""
+    channel = f"{adapters.dev / 'ttyACM0'}{speed}"
+    former, bus = BusSettings("slcan", f"-{channel}"), BusSettings("slcan", channel)
+    FaultLatch(former).engage("rig", tmp_path, "a cable broke")
+    lost = as_in_the_file(load_rig(RIG)).model_copy(update={"lost": "a cable broke"})
+    ReferenceFile(former).write(lost)
+    before = [FaultLatch(former).path, ReferenceFile(former).path]
+    link = adapters.plug_in("ttyACM0", "4.2", "207C3")
+    if shares:
+        (tmp_path / "shared").mkdir()
+        monkeypatch.setattr(state_folder, "SHARED", tmp_path / "shared")
+    for name in (channel, f"{link}{speed}"):
+        latch = FaultLatch(BusSettings("slcan", name))
+        with pytest.raises(Refused, match="a cable broke"):
+            latch.engage("rig", tmp_path)
+        reference = ReferenceFile(BusSettings("slcan", name)).read()
+        assert reference is not None
+        assert reference.lost == "a cable broke"
+    with latch.held_for_reset("rig", latch.read()):
+        pass
+    ReferenceFile(bus).write(as_in_the_file(load_rig(RIG)))
+    assert not any(path.exists() for path in before)
+    FaultLatch(bus).require_disengaged()
+
+
+def test_state_of_a_serial_device_without_usb_is_written_and_kept(tmp_path: Path) -> None:
+    """Its name is the same as before: what is written must not be removed as the former one."""
+    device = tmp_path / "ttyS0"
+    device.touch()
+    file = ReferenceFile(BusSettings("slcan", f"{device}@115200"))
+    file.write(as_in_the_file(load_rig(RIG)))
+    assert file.read() == as_in_the_file(load_rig(RIG))
+
+
 def test_two_channels_of_one_serial_adapter_are_two_buses(adapters: UsbAdapters) -> None:
     adapters.plug_in("ttyUSB0", "1", "207C3")
     unit = (adapters.sys / "class" / "ttyUSB0" / "device").resolve()
