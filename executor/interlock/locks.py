@@ -14,7 +14,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
@@ -24,6 +24,9 @@ from model.errors import HardwareMissing, Refused
 SHARED = Path("/var/lib/cdpr")
 #: Serial devices of this computer, and what they belong to. Source: Linux, sysfs-class-tty.
 DEVICES = Path("/sys/class/tty")
+#: Shorter serial numbers are those of a maker who gives all adapters the same, [characters].
+#: Source: Silicon Labs, CP2102 data sheet: "0001".
+SHORTEST_SERIAL = 5
 #: A latch, or a reference of many cables, has a few kilobytes.
 LARGEST_FILE = 65_536
 
@@ -65,8 +68,8 @@ def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
     one is latched, too.
 
     Raises:
-        HardwareMissing: The bus is that of a serial adapter which is not there, so that it is
-            unknown which one it is.
+        HardwareMissing: The bus is that of a serial adapter which is not there, or of one of two
+            with the same serial number, so that it is unknown which one it is.
     """
     interface, channel = settings.canonical.split(" ", 1)
     channels = [channel]
@@ -81,31 +84,59 @@ def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
 
 
 def _serial_adapter(device: Path) -> str:
-    """A name that an adapter keeps, whatever the number of its device.
+    """A name that an adapter keeps, whatever the number of its device."""
+    with suppress(OSError):  # unplugged meanwhile
+        if device.exists():
+            return _adapter_name(device)
+    raise HardwareMissing(
+        f"there is no serial adapter {device}",
+        where="bus.channel",
+        why="it is unplugged, or has another name since it was plugged in again; its latched"
+        " fault and homing reference are filed under the adapter, so they are unknown",
+        next_step="plug it in, and name it as in `ls /dev/serial/by-id`, which stays the same",
+    )
+
+
+def _adapter_name(device: Path) -> str:
+    """See `_serial_adapter`.
 
     USB adapters are known by their serial number, those without by the port they are plugged into;
     other devices are fixed to the computer. Source: Linux, sysfs-bus-usb.
     """
-    if not device.exists():
-        raise HardwareMissing(
-            f"there is no serial adapter {device}",
-            where="bus.channel",
-            why="it is unplugged, or has another name since it was plugged in again; its latched"
-            " fault and homing reference are filed under the adapter, so they are unknown",
-            next_step="plug it in, and name it as in `ls /dev/serial/by-id`, which stays the same",
-        )
     unit = (DEVICES / device.name / "device").resolve()
-    usb = next((folder for folder in unit.parents if (folder / "idVendor").exists()), None)
+    usb = _usb_device(unit)
     if usb is None:
         return str(device)
     interface = unit.relative_to(usb).parts[0].partition(":")[2]
     unit_of = [interface, *(path.read_text().strip() for path in unit.glob("port_number"))]
-    if (usb / "serial").exists():
-        names = [(usb / name).read_text().strip() for name in ("idVendor", "idProduct", "serial")]
-    else:
+    names = _unique_names(usb)
+    if not names:
         controller = next(folder.parent for folder in usb.parents if folder.name.startswith("usb"))
         names = [str(controller), usb.name.partition("-")[2]]  # without the number of its bus
+    others = {_usb_device(path.resolve()) for path in DEVICES.glob("tty[AU]*/device")} - {None, usb}
+    if twin := next((other for other in others if other and _unique_names(other) == names), None):
+        raise HardwareMissing(
+            f"two serial adapters have the serial number {names[-1]}",
+            where="bus.channel",
+            why=f"they are plugged into ports {usb.name} and {twin.name}; latched fault and homing"
+            " reference are filed under the serial number, so whose they are is unknown",
+            next_step="unplug one of them, or give it another serial number",
+        )
     return " ".join(["usb", *names, *unit_of])
+
+
+def _usb_device(unit: Path) -> Path | None:
+    """The USB device that a serial device belongs to; None if it is not on USB."""
+    return next((folder for folder in unit.parents if (folder / "idVendor").exists()), None)
+
+
+def _unique_names(usb: Path) -> list[str]:
+    """Vendor, product and serial number of a USB device; empty without a usable serial number."""
+    names = [usb / name for name in ("idVendor", "idProduct", "serial")]
+    if not names[-1].exists():
+        return []
+    texts = [path.read_text().strip() for path in names]
+    return texts if len(texts[-1]) >= SHORTEST_SERIAL else []
 
 
 def state_file(kind: str, settings: BusSettings) -> Path:

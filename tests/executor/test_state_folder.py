@@ -335,6 +335,7 @@ class UsbAdapters:
         (self.sys / "class" / device).mkdir()
         (self.sys / "class" / device / "device").symlink_to(usb / f"{name}:1.0")
         link = self.by_id / f"usb-{serial or port}"
+        link.unlink(missing_ok=True)
         link.symlink_to(self.dev / device)
         return link
 
@@ -421,6 +422,38 @@ def test_state_of_a_serial_device_without_usb_is_written_and_kept(tmp_path: Path
     file = ReferenceFile(BusSettings("slcan", f"{device}@115200"))
     file.write(as_in_the_file(load_rig(RIG)))
     assert file.read() == as_in_the_file(load_rig(RIG))
+
+
+def test_two_adapters_with_the_short_serial_number_of_their_maker_are_two_buses(
+    adapters: UsbAdapters, tmp_path: Path
+) -> None:
+    """All CP2102 have 0001: a reference of one rig would count for an equal one beside it."""
+    here, there = (BusSettings("slcan", str(adapters.dev / f"ttyUSB{n}")) for n in range(2))
+    adapters.plug_in("ttyUSB0", "4.1", "0001")
+    FaultLatch(here).engage("rig", tmp_path, "a cable broke")
+    adapters.plug_in("ttyUSB1", "4.2", "0001")
+    FaultLatch(there).require_disengaged()
+    with pytest.raises(Refused, match="a cable broke"):
+        FaultLatch(here).require_disengaged()
+
+
+@pytest.mark.parametrize("product", ["606f", "0000"])
+def test_two_adapters_with_the_same_serial_number_are_refused_while_both_are_there(
+    adapters: UsbAdapters, product: str
+) -> None:
+    channels = [str(adapters.dev / f"ttyUSB{number}") for number in range(2)]
+    for number, channel in enumerate(channels):
+        adapters.plug_in(Path(channel).name, f"4.{number}", "0123456789")
+    usb = (adapters.sys / "class" / "ttyUSB1" / "device").resolve().parent
+    (usb / "idProduct").write_text(f"{product}\n")
+    for channel in channels:
+        if product == "0000":
+            FaultLatch(BusSettings("slcan", channel))
+            continue
+        with pytest.raises(HardwareMissing, match="two serial adapters have the serial number"):
+            FaultLatch(BusSettings("slcan", channel))
+    shutil.rmtree(adapters.sys / "class" / "ttyUSB1")
+    FaultLatch(BusSettings("slcan", channels[0]))
 
 
 def test_two_channels_of_one_serial_adapter_are_two_buses(adapters: UsbAdapters) -> None:
