@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import stat
+from multiprocessing import current_process
 from pathlib import Path
 
 import pytest
@@ -118,6 +119,16 @@ def test_during_a_reset_the_fault_stays_and_the_process_is_that_of_the_reset(fol
         seen = service.status(rig)
         assert (seen.latched, seen.run, seen.drives) == ("a drive failed", os.getpid(), None)
         assert f"a drive failed; process {os.getpid()} is" in dict(seen.facts())["latched fault"]
+
+
+def test_a_reset_in_a_process_that_cannot_start_others_latches_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As a worker of `multiprocessing.Pool`; Python's AssertionError left the bus latched."""
+    monkeypatch.setitem(current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    with pytest.raises(BadInput, match="cannot start others, for drives in real time"):
+        service.reset(load_rig(RIG).with_bus(BUS.interface, BUS.channel))
+    FaultLatch(BUS).require_disengaged()
 
 
 REFUSED = [Refused("other drives hold"), BadInput("no rig"), StoppedByOperator("stopped")]
