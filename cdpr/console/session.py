@@ -84,9 +84,7 @@ class Console:
         self.scene = load_scene(files.scene_file) if files.scene_file else None
         self.control = PageControl(lambda: time.time_ns() // 1_000_000)
         self.verbs = StartedVerb([files.rig_file, *map(Path, files.calibration_options[1::2])])
-        # Drives simulated by each run share no bus: other robots' runs have the same bus name.
-        only = self.rig.name if is_simulated(self.rig) else None
-        self.watch = RunWatch(bus_name(self.rig), only)
+        self.watch = RunWatch(self.rig)
         self.view = RobotView(files.rig, self.scene)
         self.pictures = CameraImages()
         self.poses = TaughtPoses(MADE / "poses.json")

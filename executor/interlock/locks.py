@@ -336,6 +336,7 @@ class SetUpLock:
 POLLED_WITHIN = 1.0
 #: Readers release the lock within this time, [s].
 _READ_WITHIN = 0.2
+_CONTROL, _WISH = "control", "control-wanted"
 _LONGEST_NAME = 400
 
 
@@ -347,11 +348,13 @@ class ControlLock:
 
     def __init__(self, settings: BusSettings) -> None:
         """Opens nothing yet."""
-        self._is_shared = settings.interface != IN_PROCESS
-        self._path = state_file("control", settings).with_suffix(".lock")
-        self._wish = state_file("control-wanted", settings).with_suffix(".lock")
+        self._settings, self._is_shared = settings, settings.interface != IN_PROCESS
         self._held: int | None = None
         self._lock = threading.Lock()
+
+    def _file(self, kind: str) -> Path:
+        """A lock file: where the bus is now, as its adapter may have been plugged in meanwhile."""
+        return state_file(kind, self._settings).with_suffix(".lock")
 
     @property
     def is_held(self) -> bool:
@@ -367,15 +370,17 @@ class ControlLock:
 
         Raises:
             Refused: The lock is not a regular file, or the file system has no locks.
+            HardwareMissing: The serial adapter of the bus is not there, or not the only one.
         """
         with self._lock, ExitStack() as stack:
             if self.is_held:
                 return ""
+            path = self._file(_CONTROL)
             try:
-                self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-                handle = open_lock(self._path, create=True)
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                handle = open_lock(path, create=True)
                 stack.callback(os.close, handle)
-                wish = open_lock(self._wish, create=True)
+                wish = open_lock(self._file(_WISH), create=True)
                 stack.callback(os.close, wish)
                 if not locked_within(handle, _READ_WITHIN):
                     holder = f"{_text_of(handle)} has control, and keeps it"
@@ -389,7 +394,7 @@ class ControlLock:
                 os.pwrite(handle, name.encode()[:_LONGEST_NAME], 0)
             except OSError as error:
                 why = error.strerror or str(error)
-                return f"exclusive control cannot be ensured: {self._path}: {why}"
+                return f"exclusive control cannot be ensured: {path}: {why}"
             os.close(wish)
             stack.pop_all()
             self._held = handle
@@ -406,16 +411,16 @@ class ControlLock:
 
     def is_wanted(self) -> bool:
         """Whether another console asks for it."""
-        return self._is_shared and self._text_if_locked(self._wish) is not None
+        return self._is_shared and self._text_if_locked(_WISH) is not None
 
     def holder(self) -> str | None:
         """Name of the holder; None without one."""
-        return self._text_if_locked(self._path) if self._is_shared else None
+        return self._text_if_locked(_CONTROL) if self._is_shared else None
 
-    def _text_if_locked(self, path: Path) -> str | None:
+    def _text_if_locked(self, kind: str) -> str | None:
         try:
-            handle = open_lock(path)
-        except OSError:  # no console of this computer has had control
+            handle = open_lock(self._file(kind))
+        except (OSError, HardwareMissing):  # no console of this computer has control of the bus
             return None
         try:
             return None if locked_within(handle, 0.0, fcntl.LOCK_SH) else _text_of(handle)
