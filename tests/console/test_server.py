@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -33,6 +34,7 @@ from websockets.sync.client import ClientConnection, connect
 from cdpr.cli.operate.run import show
 from cdpr.console import server, session, view
 from cdpr.console.commands import (
+    AWAITED,
     MOST_WAITING,
     Held,
     LetGo,
@@ -718,6 +720,39 @@ def test_a_command_that_waited_too_long_is_not_begun(
         assert state(page)["busy"] is None
         assert command(page, "home")["ok"]
         assert [verb for verb, _ in served.started] == ["home"]
+
+
+def test_a_run_may_read_its_drives_longer_than_a_command_may_wait(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A serial adapter opens in 2 s, and a silent drive takes a second: no run ever began."""
+    monkeypatch.chdir(folder)
+    served = Served()
+    console, clock = served.console, time.clock_gettime
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    console.plan.load(Path("short.json"))
+    shown = console.plan.preview
+    assert shown is not None
+
+    def read_slowly() -> None:
+        monkeypatch.setattr(time, "clock_gettime", lambda which: clock(which) + 10.0 * LONGEST_WAIT)
+
+    monkeypatch.setattr(console.robot, "pose_at_rest", read_slowly)
+    message = parse_message(
+        json.dumps({"kind": "command", "command": "run", "plan": shown["hash"]})
+    )
+    assert not isinstance(message, Held | LetGo | Seen)
+    assert console.command(page, message, arrived_now()) == ""
+    assert [verb for verb, _ in served.started] == ["run"]
+    console.close()
+
+
+def test_a_page_awaits_the_answers_of_the_commands_that_may_begin_late() -> None:
+    script = (Path(server.__file__).parent / "static" / "connection.js").read_text()
+    awaited = re.search(r"^const LONG = (\[.*\]);$", script, re.MULTILINE)
+    assert awaited is not None
+    assert set(json.loads(awaited[1])) == AWAITED
 
 
 def test_a_command_does_not_wait_long_for_one_of_another_thread(
