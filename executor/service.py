@@ -54,7 +54,7 @@ from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
 from executor.supervision import Supervisor
-from model.errors import CdprError, truth_value
+from model.errors import CdprError, require_child_processes, truth_value
 from model.files.documents import PoseDocument
 from model.pages.page import FactsDisplay
 from model.pose import Pose
@@ -311,10 +311,12 @@ def reset(
 
     Raises:
         StoppedByOperator: Cancelled.
+        BadInput: It needs a process of its own, which this one cannot start.
         CdprError: A run is active; or a drive does not answer, may not be reset now, or stays in
             fault.
     """
     require_imported_script()
+    require_child_processes("drives in real time")
     require_other_process(rig)
     settings = BusSettings.of(rig)
     latch = FaultLatch(settings, rig.drive_names)

@@ -28,6 +28,8 @@ LONGEST = 4096
 MOST_WAITING = 8
 #: Commands to a run that moves: they wait for no other command, such as loading a plan.
 TO_RUN = frozenset({"hold", "resume", "speed"})
+#: Commands whose answer a page awaits, as they load files or read drives once they are begun.
+AWAITED = frozenset({"load_plan", "compare", "run", "plan", "teach", "teach_at"})
 
 Text = Annotated[str, Field(max_length=400)]
 Millimetres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]

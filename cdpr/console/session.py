@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from cdpr.console.commands import (
+    AWAITED,
     TO_RUN,
     CompareCommand,
     FileCommand,
@@ -84,9 +85,7 @@ class Console:
         self.scene = load_scene(files.scene_file) if files.scene_file else None
         self.control = PageControl(lambda: time.time_ns() // 1_000_000)
         self.verbs = StartedVerb([files.rig_file, *map(Path, files.calibration_options[1::2])])
-        # Drives simulated by each run share no bus: other robots' runs have the same bus name.
-        only = self.rig.name if is_simulated(self.rig) else None
-        self.watch = RunWatch(bus_name(self.rig), only)
+        self.watch = RunWatch(self.rig)
         self.view = RobotView(files.rig, self.scene)
         self.pictures = CameraImages()
         self.poses = TaughtPoses(MADE / "poses.json")
@@ -259,20 +258,21 @@ class Console:
             return "take control first"
         require = partial(self._require, page, arrived)
         if message.command in TO_RUN:
-            require()
+            require(LONGEST_WAIT)
             percent = {"percent": message.percent} if isinstance(message, SpeedCommand) else {}
             return self.watch.send(message.command, **percent)
         if not self._one_at_a_time.acquire(timeout=LONGEST_WAIT):
             return "another command is not finished yet"
         try:
-            self._require_wanted = require
-            require()
+            require(LONGEST_WAIT)
+            longest = math.inf if message.command in AWAITED else LONGEST_WAIT
+            self._require_wanted = partial(require, longest)
             return self._operate(message)
         finally:
             self._one_at_a_time.release()
 
-    def _require(self, page: int, arrived: float) -> None:
-        """Requires that no stop came after a command, and that its page still has control.
+    def _require(self, page: int, arrived: float, longest: float) -> None:
+        """Requires no stop since a command, control, and a wait of at most ``longest`` [s].
 
         Raises:
             Refused: A command that waited, such as for the drives to be read, is not wanted now,
@@ -287,7 +287,7 @@ class Console:
         if self.control.holder != page:
             raise Refused("the page lost control before this command began", where="console")
         waited = time.clock_gettime(time.CLOCK_BOOTTIME) - arrived
-        if waited > LONGEST_WAIT:
+        if waited > longest:
             raise Refused(
                 f"the command waited {waited:.1f} s and was not begun",
                 where="console",

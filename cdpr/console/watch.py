@@ -17,9 +17,11 @@ from typing import Any
 
 from cdpr.console.view import RobotNow, RobotView, commanded_pose
 from executor.cameras.live_image import ImageReader, LiveImage
+from executor.drives import is_simulated
 from executor.remote.client import Answer, RunLink, cable_tension
 from executor.remote.command_socket import find_runs
 from executor.remote.protocol import make_line
+from executor.remote.status import bus_name
 from executor.service import StatusResult
 from model.errors import CdprError, Refused
 from model.pose import Pose
@@ -68,11 +70,11 @@ class RunReport:
 
 
 class RunWatch:
-    """Follows the runs on one bus; thread-safe."""
+    """Follows the runs on the bus of a rig; thread-safe."""
 
-    def __init__(self, bus: str, rig: str | None = None) -> None:
-        """Starts unconnected; ``bus`` and ``rig`` as in a run's status, None for any rig."""
-        self._bus, self._rig = bus, rig
+    def __init__(self, rig: Rig) -> None:
+        """Starts unconnected."""
+        self._rig = rig
         self._lock = threading.Lock()
         self._links = ExitStack()
         self._run: RunLink | None = None
@@ -197,7 +199,11 @@ class RunWatch:
         self._count += 1
 
     def _is_here(self, status: dict[str, Any]) -> bool:
-        return status["bus"] == self._bus and self._rig in (None, status["rig"])
+        """Whether a run is on this bus, whose serial adapter may have another number since."""
+        if status["bus"] != bus_name(self._rig):
+            return False
+        # Drives simulated by each run share no bus: other robots' runs have the same bus name.
+        return not is_simulated(self._rig) or status["rig"] == self._rig.name
 
     def _disconnect(self) -> None:
         self._run = None

@@ -162,7 +162,7 @@ class MultiCameraMonitor:
 
 #: Largest wait for the last images at the end of a run, [s].
 PATIENCE = 20.0
-#: The same after a stop, and the interval of checks for a stop, [s].
+#: The same after the operator's stop, and the interval of checks for a stop, [s].
 HURRY, ROUND = 2.0, 0.05
 
 
@@ -422,8 +422,9 @@ class CameraWatch:
         Args:
             at: The end of the run, on the loop's clock, [s].
         """
-        with self._listener.waiting("waiting for the last images"):
-            seen = self._cameras.finish(lambda: self._board.read().stop)
+        read = self._board.read
+        with self._listener.waiting("waiting for the last images"):  # if it raises, it asks to stop
+            seen = self._cameras.finish(lambda: (now := read()).stop and now.for_what is None)
         self._report_news(at)
         for camera in seen.cameras:
             if camera.dropped:

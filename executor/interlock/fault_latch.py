@@ -7,7 +7,7 @@ disengages it then.
 
 A program that moves or resets the drives also holds a file lock, which the system releases when
 that program ends in any manner; this distinguishes an active run from the latch of an earlier one.
-The locked file contains the program's process ID.
+The locked file contains the program's process ID, and whether a fault was latched before.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ from model.files.documents import write_atomic
 LOCK_TIMEOUT = 0.5
 
 _UNKNOWN = "unknown"
+#: In the lock after the process ID.
+_DURING_FAULT = " during a latched fault"
 _CUT_SHORT = "a run did not finish: its program was killed, or the computer stopped"
 
 
@@ -100,14 +102,16 @@ class FaultLatch:
         """
         latched = self.read()
         while True:
-            holder = self.holder()
+            held = self._lock_text()
             again = self.read()
             if again == latched:
                 break
             latched = again
-        if latched is None or holder is None:
+        if latched is None or held is None:
             return latched, None
-        return (None if holder in (0, latched.process) else latched), holder or latched.process
+        holder = _process_in(held)
+        is_of_motion = _DURING_FAULT not in held and holder in (0, latched.process)
+        return (None if is_of_motion else latched), holder or latched.process
 
     def require_disengaged(self) -> None:
         """Requires the latch to be disengaged.
@@ -191,7 +195,7 @@ class FaultLatch:
         Raises:
             Refused: Another fault is latched now, or another program moves or resets the drives.
         """
-        self._hold()
+        self._hold(_DURING_FAULT)
         if self.read() != shown:
             self.let_go()
             raise Refused(
@@ -242,8 +246,11 @@ class FaultLatch:
             raise self._not_kept(error.strerror) from None
         self.let_go()
 
-    def _hold(self) -> None:
+    def _hold(self, state: str = "") -> None:
         """Takes the lock until it is released or this program ends; waits for readers.
+
+        Args:
+            state: `_DURING_FAULT` if a fault is latched.
 
         Raises:
             Refused: Another program moves or resets the drives, or the lock cannot be made.
@@ -259,7 +266,7 @@ class FaultLatch:
                 raise self._refusal(self.read())
             with suppress(OSError):  # another user's file of an earlier version
                 os.truncate(lock, 0)
-                os.pwrite(lock, str(os.getpid()).encode(), 0)
+                os.pwrite(lock, f"{os.getpid()}{state}".encode(), 0)
         except BaseException:
             os.close(lock)
             raise
@@ -277,6 +284,11 @@ class FaultLatch:
 
     def holder(self) -> int | None:
         """Process ID of another program that moves or resets the drives now; 0 if unknown."""
+        held = self._lock_text()
+        return None if held is None else _process_in(held)
+
+    def _lock_text(self) -> str | None:
+        """Content of the lock that another program holds; None if none does."""
         if self._held is not None:
             return None
         try:
@@ -288,8 +300,7 @@ class FaultLatch:
         try:
             if locked_within(lock, 0.0, fcntl.LOCK_SH):
                 return None
-            text = os.pread(lock, 20, 0)
-            return int(text) if text.isdigit() else 0
+            return os.pread(lock, 40, 0).decode("ascii", "replace")
         finally:
             os.close(lock)
 
@@ -331,3 +342,9 @@ class FaultLatch:
             why=why or "the operating system gives no reason",
             next_step="make the folder writable for the operators of the rig",
         )
+
+
+def _process_in(lock_text: str) -> int:
+    """The process ID in the text of a lock; 0 if unknown."""
+    number = lock_text.partition(" ")[0]
+    return int(number) if number.isdecimal() else 0

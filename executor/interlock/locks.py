@@ -14,7 +14,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
@@ -24,6 +24,9 @@ from model.errors import HardwareMissing, Refused
 SHARED = Path("/var/lib/cdpr")
 #: Serial devices of this computer, and what they belong to. Source: Linux, sysfs-class-tty.
 DEVICES = Path("/sys/class/tty")
+#: Shorter serial numbers are those of a maker who gives all adapters the same, [characters].
+#: Source: Silicon Labs, CP2102 data sheet: "0001".
+SHORTEST_SERIAL = 5
 #: A latch, or a reference of many cables, has a few kilobytes.
 LARGEST_FILE = 65_536
 
@@ -61,45 +64,79 @@ def state_folders() -> tuple[Path, ...]:
 def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
     """The file of a kind, such as ``latched``, for a bus; then where it was before, if readable.
 
+    Those of a serial adapter were named after its device, which may be another adapter's now: that
+    one is latched, too.
+
     Raises:
-        HardwareMissing: The bus is that of a serial adapter which is not there, so that it is
-            unknown which one it is.
+        HardwareMissing: The bus is that of a serial adapter which is not there, or of one of two
+            with the same serial number, so that it is unknown which one it is.
     """
     interface, channel = settings.canonical.split(" ", 1)
-    if channel.startswith("/"):
-        channel = _serial_adapter(Path(channel))
-    name = re.sub(r"[^A-Za-z0-9.]+", "-", f"{interface} {channel}")
+    channels = [channel]
+    if channel.startswith("/"):  # after its device, where it was before, also with its speed
+        _, at, speed = settings.channel.strip().partition("@")
+        channels = [_serial_adapter(Path(channel)), channel, f"{channel}{at}{speed}"]
+    names = [re.sub(r"[^A-Za-z0-9.]+", "-", f"{interface} {one}") for one in channels]
     first, *earlier = state_folders()
-    readable = [folder for folder in earlier if os.access(folder, os.R_OK | os.X_OK)]
-    return tuple(folder / f"{kind}-{name}.json" for folder in (first, *readable))
+    folders = [first, *(one for one in earlier if os.access(one, os.R_OK | os.X_OK))]
+    files = [folder / f"{kind}-{name}.json" for name in names for folder in folders]
+    return tuple(dict.fromkeys(files))
 
 
 def _serial_adapter(device: Path) -> str:
-    """A name that an adapter keeps, whatever the number of its device.
+    """A name that an adapter keeps, whatever the number of its device."""
+    with suppress(OSError):  # unplugged meanwhile
+        if device.exists():
+            return _adapter_name(device)
+    raise HardwareMissing(
+        f"there is no serial adapter {device}",
+        where="bus.channel",
+        why="it is unplugged, or has another name since it was plugged in again; its latched"
+        " fault and homing reference are filed under the adapter, so they are unknown",
+        next_step="plug it in, and name it as in `ls /dev/serial/by-id`, which stays the same",
+    )
+
+
+def _adapter_name(device: Path) -> str:
+    """See `_serial_adapter`.
 
     USB adapters are known by their serial number, those without by the port they are plugged into;
     other devices are fixed to the computer. Source: Linux, sysfs-bus-usb.
     """
-    if not device.exists():
-        raise HardwareMissing(
-            f"there is no serial adapter {device}",
-            where="bus.channel",
-            why="it is unplugged, or has another name since it was plugged in again; its latched"
-            " fault and homing reference are filed under the adapter, so they are unknown",
-            next_step="plug it in, and name it as in `ls /dev/serial/by-id`, which stays the same",
-        )
     unit = (DEVICES / device.name / "device").resolve()
-    usb = next((folder for folder in unit.parents if (folder / "idVendor").exists()), None)
+    usb = _usb_device(unit)
     if usb is None:
         return str(device)
     interface = unit.relative_to(usb).parts[0].partition(":")[2]
     unit_of = [interface, *(path.read_text().strip() for path in unit.glob("port_number"))]
-    if (usb / "serial").exists():
-        names = [(usb / name).read_text().strip() for name in ("idVendor", "idProduct", "serial")]
-    else:
+    names = _unique_names(usb)
+    if not names:
         controller = next(folder.parent for folder in usb.parents if folder.name.startswith("usb"))
         names = [str(controller), usb.name.partition("-")[2]]  # without the number of its bus
+    others = {_usb_device(path.resolve()) for path in DEVICES.glob("tty[AU]*/device")} - {None, usb}
+    if twin := next((other for other in others if other and _unique_names(other) == names), None):
+        raise HardwareMissing(
+            f"two serial adapters have the serial number {names[-1]}",
+            where="bus.channel",
+            why=f"they are plugged into ports {usb.name} and {twin.name}; latched fault and homing"
+            " reference are filed under the serial number, so whose they are is unknown",
+            next_step="unplug one of them, or give it another serial number",
+        )
     return " ".join(["usb", *names, *unit_of])
+
+
+def _usb_device(unit: Path) -> Path | None:
+    """The USB device that a serial device belongs to; None if it is not on USB."""
+    return next((folder for folder in unit.parents if (folder / "idVendor").exists()), None)
+
+
+def _unique_names(usb: Path) -> list[str]:
+    """Vendor, product and serial number of a USB device; empty without a usable serial number."""
+    names = [usb / name for name in ("idVendor", "idProduct", "serial")]
+    if not names[-1].exists():
+        return []
+    texts = [path.read_text().strip() for path in names]
+    return texts if len(texts[-1]) >= SHORTEST_SERIAL else []
 
 
 def state_file(kind: str, settings: BusSettings) -> Path:
@@ -299,6 +336,7 @@ class SetUpLock:
 POLLED_WITHIN = 1.0
 #: Readers release the lock within this time, [s].
 _READ_WITHIN = 0.2
+_CONTROL, _WISH = "control", "control-wanted"
 _LONGEST_NAME = 400
 
 
@@ -310,11 +348,13 @@ class ControlLock:
 
     def __init__(self, settings: BusSettings) -> None:
         """Opens nothing yet."""
-        self._is_shared = settings.interface != IN_PROCESS
-        self._path = state_file("control", settings).with_suffix(".lock")
-        self._wish = state_file("control-wanted", settings).with_suffix(".lock")
+        self._settings, self._is_shared = settings, settings.interface != IN_PROCESS
         self._held: int | None = None
         self._lock = threading.Lock()
+
+    def _file(self, kind: str) -> Path:
+        """A lock file: where the bus is now, as its adapter may have been plugged in meanwhile."""
+        return state_file(kind, self._settings).with_suffix(".lock")
 
     @property
     def is_held(self) -> bool:
@@ -330,15 +370,17 @@ class ControlLock:
 
         Raises:
             Refused: The lock is not a regular file, or the file system has no locks.
+            HardwareMissing: The serial adapter of the bus is not there, or not the only one.
         """
         with self._lock, ExitStack() as stack:
             if self.is_held:
                 return ""
+            path = self._file(_CONTROL)
             try:
-                self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-                handle = open_lock(self._path, create=True)
+                path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+                handle = open_lock(path, create=True)
                 stack.callback(os.close, handle)
-                wish = open_lock(self._wish, create=True)
+                wish = open_lock(self._file(_WISH), create=True)
                 stack.callback(os.close, wish)
                 if not locked_within(handle, _READ_WITHIN):
                     holder = f"{_text_of(handle)} has control, and keeps it"
@@ -352,7 +394,7 @@ class ControlLock:
                 os.pwrite(handle, name.encode()[:_LONGEST_NAME], 0)
             except OSError as error:
                 why = error.strerror or str(error)
-                return f"exclusive control cannot be ensured: {self._path}: {why}"
+                return f"exclusive control cannot be ensured: {path}: {why}"
             os.close(wish)
             stack.pop_all()
             self._held = handle
@@ -369,16 +411,16 @@ class ControlLock:
 
     def is_wanted(self) -> bool:
         """Whether another console asks for it."""
-        return self._is_shared and self._text_if_locked(self._wish) is not None
+        return self._is_shared and self._text_if_locked(_WISH) is not None
 
     def holder(self) -> str | None:
         """Name of the holder; None without one."""
-        return self._text_if_locked(self._path) if self._is_shared else None
+        return self._text_if_locked(_CONTROL) if self._is_shared else None
 
-    def _text_if_locked(self, path: Path) -> str | None:
+    def _text_if_locked(self, kind: str) -> str | None:
         try:
-            handle = open_lock(path)
-        except OSError:  # no console of this computer has had control
+            handle = open_lock(self._file(kind))
+        except (OSError, HardwareMissing):  # no console of this computer has control of the bus
             return None
         try:
             return None if locked_within(handle, 0.0, fcntl.LOCK_SH) else _text_of(handle)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
 from executor.cameras.client import CameraClient
-from executor.cameras.multi_camera import CameraWatch, RunCameras
-from executor.supervision import LocalRequests, StopReason
+from executor.cameras.multi_camera import CameraRecords, CameraWatch, RunCameras
+from executor.supervision import Callbacks, GuardedListener, LocalRequests, StopReason
+from model.progress import Listener
 from tests.executor.test_run_cameras import MODEL, RATE, Scripted
 
 
@@ -55,3 +58,30 @@ def test_too_little_clearance_stops_the_run(names: list[str], who: str) -> None:
     assert reason.text.startswith(f"{who} measured less clearance than the scene requires: ")
     board, _ = watched(4, 10.0, *(Scripted(name, [0]) for name in names), clearance_stop=False)
     assert not board.read().stop
+
+
+@pytest.mark.parametrize(("stop", "waits"), [("listener", True), ("operator", False)])
+def test_the_wait_for_the_last_images_is_cut_short_by_the_operator_alone(
+    stop: str, waits: bool
+) -> None:
+    """A listener that raises ends no wait: the images of real time would be missing."""
+    board, asked = LocalRequests(), list[bool]()
+
+    class Raising(Listener):
+        def waiting(self, text: str) -> AbstractContextManager[None]:
+            raise RuntimeError(f"the display is gone: {text}")
+
+    def finish(stopped: Callable[[], bool]) -> CameraRecords:
+        if stop == "operator":
+            board.ask_stop()
+        asked.append(stopped())
+        return CameraRecords()
+
+    cameras: Any = SimpleNamespace(finish=finish, news=list)
+    listener = Raising() if stop == "listener" else Listener()
+    guarded, status = GuardedListener(listener, Callbacks(board.ask_stop)), cast(Any, None)
+    CameraWatch(
+        cameras, status, board, lambda *_: None, clearance_stop=True, listener=guarded
+    ).finish(1.0)
+    assert board.read().stop
+    assert asked == [not waits]

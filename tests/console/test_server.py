@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -33,6 +34,7 @@ from websockets.sync.client import ClientConnection, connect
 from cdpr.cli.operate.run import show
 from cdpr.console import server, session, view
 from cdpr.console.commands import (
+    AWAITED,
     MOST_WAITING,
     Held,
     LetGo,
@@ -720,6 +722,39 @@ def test_a_command_that_waited_too_long_is_not_begun(
         assert [verb for verb, _ in served.started] == ["home"]
 
 
+def test_a_run_may_read_its_drives_longer_than_a_command_may_wait(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A serial adapter opens in 2 s, and a silent drive takes a second: no run ever began."""
+    monkeypatch.chdir(folder)
+    served = Served()
+    console, clock = served.console, time.clock_gettime
+    page = console.control.join("here")
+    console.control.take(page, moving=False)
+    console.plan.load(Path("short.json"))
+    shown = console.plan.preview
+    assert shown is not None
+
+    def read_slowly() -> None:
+        monkeypatch.setattr(time, "clock_gettime", lambda which: clock(which) + 10.0 * LONGEST_WAIT)
+
+    monkeypatch.setattr(console.robot, "pose_at_rest", read_slowly)
+    message = parse_message(
+        json.dumps({"kind": "command", "command": "run", "plan": shown["hash"]})
+    )
+    assert not isinstance(message, Held | LetGo | Seen)
+    assert console.command(page, message, arrived_now()) == ""
+    assert [verb for verb, _ in served.started] == ["run"]
+    console.close()
+
+
+def test_a_page_awaits_the_answers_of_the_commands_that_may_begin_late() -> None:
+    script = (Path(server.__file__).parent / "static" / "connection.js").read_text()
+    awaited = re.search(r"^const LONG = (\[.*\]);$", script, re.MULTILINE)
+    assert awaited is not None
+    assert set(json.loads(awaited[1])) == AWAITED
+
+
 def test_a_command_does_not_wait_long_for_one_of_another_thread(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -926,10 +961,15 @@ def test_a_motion_is_found_however_its_rig_file_spells_the_bus(tmp_path: Path, k
     (tmp_path / "by-id").symlink_to(tmp_path / "ttyACM0")
     names = {
         "udp_multicast": ("239.74.163.67", "239.74.163.67:43113"),
-        "slcan": (str(tmp_path / "ttyACM0"), str(tmp_path / "by-id")),
+        "slcan": (str(tmp_path / "by-id"), str(tmp_path / "ttyACM0")),
     }
     here, there = (load_rig(RIG).with_bus(kind, name) for name in names[kind])
-    watch = RunWatch(bus_name(here))
+    watch = RunWatch(here)
+    if kind == "slcan":  # plugged in again, it got another number
+        (tmp_path / "ttyACM0").rename(tmp_path / "ttyACM1")
+        (tmp_path / "by-id").unlink()
+        (tmp_path / "by-id").symlink_to(tmp_path / "ttyACM1")
+        there = here.with_bus(kind, str(tmp_path / "ttyACM1"))
     with commands_from_start("run", there, Supervisor(), realtime=False) as ahead:
         assert [one["process"] for one in preparations(bus_name(here))] == [os.getpid()]
         assert watch.why_busy() == "a motion is being prepared; wait, or stop it"
@@ -1020,6 +1060,29 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
     assert asked(other, theirs, "take_control") == ""
     for console in (one, other):
         console.close()
+
+
+def test_a_console_begins_without_its_serial_adapter_and_gives_control_with_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whose state files, and so the lock of control, are filed under the adapter."""
+    monkeypatch.setattr("cdpr.console.session.read_status", lambda _: pytest.fail("read"))
+    monkeypatch.setattr(RobotWatch, "update", lambda *_, **__: None)
+    device = tmp_path / "ttyACM0"
+    rig = load_rig(RIG).with_bus("slcan", str(device))
+    console = Console(replace(Served().console.files, rig=rig))
+    page = console.control.join("here")
+    take = parse_message('{"kind": "command", "command": "take_control"}')
+    assert not isinstance(take, Held | LetGo | Seen)
+    assert console.update()["reference"]["why_not"] == f"there is no serial adapter {device}"
+    assert f"there is no serial adapter {device}" in console.command(page, take, arrived_now())
+    assert console.control.holder is None
+    device.touch()
+    assert console.command(page, take, arrived_now()) == ""
+    device.unlink()
+    console.update()
+    assert console.control.holder == page
+    console.close()
 
 
 def latching_console(monkeypatch: pytest.MonkeyPatch, channel: str) -> tuple[Console, FaultLatch]:

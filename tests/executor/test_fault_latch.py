@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import stat
+from multiprocessing import current_process
 from pathlib import Path
 
 import pytest
@@ -99,8 +100,14 @@ def test_a_reset_keeps_runs_off_the_bus_and_ends_disengaged(folder: Path) -> Non
     assert not other.held_by_another()
 
 
-def test_during_a_reset_the_fault_stays_and_the_process_is_that_of_the_reset(folder: Path) -> None:
-    """It was that of the run, which may be long gone, and no fault was latched."""
+@pytest.mark.parametrize("same_process", [False, True])
+def test_during_a_reset_the_fault_stays_and_the_process_is_that_of_the_reset(
+    folder: Path, same_process: bool
+) -> None:
+    """It was that of the run, which may be long gone, and no fault was latched.
+
+    A script may run and reset; or two have the same number, as in a container.
+    """
     mine, other = two()
     mine.engage("gachon_8_6", folder)
     assert other.read_in_motion() == (None, os.getpid()), "its fault is latched if it ends badly"
@@ -111,6 +118,9 @@ def test_during_a_reset_the_fault_stays_and_the_process_is_that_of_the_reset(fol
     mine.path.write_text(json.dumps(dataclasses.asdict(gone)))
     assert other.read_in_motion() == (gone, None)
     rig = load_rig(RIG).with_bus(BUS.interface, BUS.channel)
+    if same_process:
+        mine.path.write_text(json.dumps(dataclasses.asdict(latched)))
+        gone = latched
     with mine.held_for_reset("gachon_8_6", gone):
         assert other.read_in_motion() == (gone, os.getpid())
         with pytest.raises(Refused, match=rf"\(process {os.getpid()}\) is in progress"):
@@ -118,6 +128,16 @@ def test_during_a_reset_the_fault_stays_and_the_process_is_that_of_the_reset(fol
         seen = service.status(rig)
         assert (seen.latched, seen.run, seen.drives) == ("a drive failed", os.getpid(), None)
         assert f"a drive failed; process {os.getpid()} is" in dict(seen.facts())["latched fault"]
+
+
+def test_a_reset_in_a_process_that_cannot_start_others_latches_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As a worker of `multiprocessing.Pool`; Python's AssertionError left the bus latched."""
+    monkeypatch.setitem(current_process()._config, "daemon", True)  # type: ignore[attr-defined]
+    with pytest.raises(BadInput, match="cannot start others, for drives in real time"):
+        service.reset(load_rig(RIG).with_bus(BUS.interface, BUS.channel))
+    FaultLatch(BUS).require_disengaged()
 
 
 REFUSED = [Refused("other drives hold"), BadInput("no rig"), StoppedByOperator("stopped")]

@@ -335,6 +335,7 @@ class UsbAdapters:
         (self.sys / "class" / device).mkdir()
         (self.sys / "class" / device / "device").symlink_to(usb / f"{name}:1.0")
         link = self.by_id / f"usb-{serial or port}"
+        link.unlink(missing_ok=True)
         link.symlink_to(self.dev / device)
         return link
 
@@ -377,6 +378,82 @@ def test_a_serial_adapter_keeps_latch_and_reference_when_it_gets_another_number(
     assert reference.lost == "a cable broke"
     other = BusSettings("slcan", str(adapters.dev / "ttyACM0"))
     assert (FaultLatch(other).read(), ReferenceFile(other).read()) == (None, None)
+
+
+@pytest.mark.parametrize("speed", ["", "@115200"])
+@pytest.mark.parametrize("shares", [False, True])
+def test_a_serial_adapter_keeps_latch_and_reference_filed_under_its_device(
+    adapters: UsbAdapters,
+    speed: str,
+    shares: bool,
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As they were before adapters were known by serial number; then the folder may change, too."""
+    channel = f"{adapters.dev / 'ttyACM0'}{speed}"
+    former, bus = BusSettings("slcan", f"-{channel}"), BusSettings("slcan", channel)
+    FaultLatch(former).engage("rig", tmp_path, "a cable broke")
+    lost = as_in_the_file(load_rig(RIG)).model_copy(update={"lost": "a cable broke"})
+    ReferenceFile(former).write(lost)
+    before = [FaultLatch(former).path, ReferenceFile(former).path]
+    link = adapters.plug_in("ttyACM0", "4.2", "207C3")
+    if shares:
+        (tmp_path / "shared").mkdir()
+        monkeypatch.setattr(state_folder, "SHARED", tmp_path / "shared")
+    for name in (channel, f"{link}{speed}"):
+        latch = FaultLatch(BusSettings("slcan", name))
+        with pytest.raises(Refused, match="a cable broke"):
+            latch.engage("rig", tmp_path)
+        reference = ReferenceFile(BusSettings("slcan", name)).read()
+        assert reference is not None
+        assert reference.lost == "a cable broke"
+    with latch.held_for_reset("rig", latch.read()):
+        pass
+    ReferenceFile(bus).write(as_in_the_file(load_rig(RIG)))
+    assert not any(path.exists() for path in before)
+    FaultLatch(bus).require_disengaged()
+
+
+def test_state_of_a_serial_device_without_usb_is_written_and_kept(tmp_path: Path) -> None:
+    """Its name is the same as before: what is written must not be removed as the former one."""
+    device = tmp_path / "ttyS0"
+    device.touch()
+    file = ReferenceFile(BusSettings("slcan", f"{device}@115200"))
+    file.write(as_in_the_file(load_rig(RIG)))
+    assert file.read() == as_in_the_file(load_rig(RIG))
+
+
+def test_two_adapters_with_the_short_serial_number_of_their_maker_are_two_buses(
+    adapters: UsbAdapters, tmp_path: Path
+) -> None:
+    """All CP2102 have 0001: a reference of one rig would count for an equal one beside it."""
+    here, there = (BusSettings("slcan", str(adapters.dev / f"ttyUSB{n}")) for n in range(2))
+    adapters.plug_in("ttyUSB0", "4.1", "0001")
+    FaultLatch(here).engage("rig", tmp_path, "a cable broke")
+    adapters.plug_in("ttyUSB1", "4.2", "0001")
+    FaultLatch(there).require_disengaged()
+    with pytest.raises(Refused, match="a cable broke"):
+        FaultLatch(here).require_disengaged()
+
+
+@pytest.mark.parametrize("product", ["606f", "0000"])
+def test_two_adapters_with_the_same_serial_number_are_refused_while_both_are_there(
+    adapters: UsbAdapters, product: str
+) -> None:
+    channels = [str(adapters.dev / f"ttyUSB{number}") for number in range(2)]
+    for number, channel in enumerate(channels):
+        adapters.plug_in(Path(channel).name, f"4.{number}", "0123456789")
+    usb = (adapters.sys / "class" / "ttyUSB1" / "device").resolve().parent
+    (usb / "idProduct").write_text(f"{product}\n")
+    for channel in channels:
+        if product == "0000":
+            FaultLatch(BusSettings("slcan", channel))
+            continue
+        with pytest.raises(HardwareMissing, match="two serial adapters have the serial number"):
+            FaultLatch(BusSettings("slcan", channel))
+    shutil.rmtree(adapters.sys / "class" / "ttyUSB1")
+    FaultLatch(BusSettings("slcan", channels[0]))
 
 
 def test_two_channels_of_one_serial_adapter_are_two_buses(adapters: UsbAdapters) -> None:

@@ -11,8 +11,8 @@ the server rejected; `detail` gives the reason). */
 /** The page must report stale data within 0.5 s: less one frame and one state. */
 export const STALE_S = 0.45;
 const TICK_MS = 50, ANSWER_MS = 5000, RECONNECT_MS = [250, 500, 1000, 2000];
-/** Commands that may take minutes: the state names what is being loaded meanwhile. */
-const LONG = ["load_plan", "compare"];
+/** Commands that load files or read drives once they are begun: their answers are awaited. */
+const LONG = ["load_plan", "compare", "run", "plan", "teach", "teach_at"];
 /** Largest difference in rate of two computers' clocks. */
 const DRIFT = 2e-4;
 /** States of a run whose own status must be fresh; in all others nothing moves. */
