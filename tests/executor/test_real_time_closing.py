@@ -119,12 +119,10 @@ def falls_silent_behind_its_brakes(_job: Any, link: Connection, _supervisor: int
     link.send(Failed(HardwareMissing(SILENT)))
 
 
-@pytest.mark.parametrize(("lets_go", "holding"), [(2, True), (4, False)])
-def test_a_drive_that_never_held_is_no_doubt_about_a_motion_that_did_not_begin(
-    monkeypatch: pytest.MonkeyPatch, lets_go: int, holding: bool
-) -> None:
-    monkeypatch.setattr(real_time_process, "serve", falls_silent_behind_its_brakes)
+def end_where(lets_go: int) -> Ended:
+    """The end of a motion after which a drive holds no longer, unless it is excused."""
     board = SharedRequests()
+    records: Any = SimpleNamespace(take_event=lambda _: None, take_cycle=lambda *_: None)
     motion_on_board: Any = (Still(), print, board)
     try:
         with real_time_process.real_time_process(
@@ -132,10 +130,18 @@ def test_a_drive_that_never_held_is_no_doubt_about_a_motion_that_did_not_begin(
             need_real_time=False,
             check_drives=lambda released: "" if lets_go in released else f"drive {lets_go} let go",
         ) as process:
-            process.arm(SimpleNamespace(take_event=lambda _event: None))  # type: ignore[arg-type]
-            ended = process.run()
+            process.arm(records)
+            return process.run()
     finally:
         board.close()
+
+
+@pytest.mark.parametrize(("lets_go", "holding"), [(2, True), (4, False)])
+def test_a_drive_that_never_held_is_no_doubt_about_a_motion_that_did_not_begin(
+    monkeypatch: pytest.MonkeyPatch, lets_go: int, holding: bool
+) -> None:
+    monkeypatch.setattr(real_time_process, "serve", falls_silent_behind_its_brakes)
+    ended = end_where(lets_go)
     assert (ended.state, ended.holding) == (State.LATCHED, holding)
 
 
@@ -178,19 +184,7 @@ def test_a_process_that_dies_while_enabling_casts_doubt_only_on_drives_that_had_
 ) -> None:
     """A lost or unknown status word counts as torque, and so does a record that was lost."""
     monkeypatch.setattr(real_time_process, "serve", partial(dies_after, words, missing))
-    board = SharedRequests()
-    records: Any = SimpleNamespace(take_event=lambda _: None, take_cycle=lambda *_: None)
-    motion_on_board: Any = (Still(), print, board)
-    try:
-        with real_time_process.real_time_process(
-            *motion_on_board,
-            need_real_time=False,
-            check_drives=lambda released: "" if lets_go in released else f"drive {lets_go} let go",
-        ) as process:
-            process.arm(records)
-            ended = process.run()
-    finally:
-        board.close()
+    ended = end_where(lets_go)
     assert (ended.state, ended.holding) == (State.LATCHED, holding)
 
 
