@@ -274,13 +274,15 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose, *, turns: b
         rms_anchor_radius(rig.anchors),
     )
     has, needs, _ = distinct_figures((margin, reserve, 0.0), 2)
+    larger = f"move the {name} to a larger margin (`cdpr workspace` maps it), {remedy(*binding)}"
+    if turns and margin >= margin_reserve(rig, scene.load, turns=False):
+        larger += ", or plan without rotation (no `--free-rotation`)"
     if 0.0 <= margin < inertial_wrench(rig, scene.load, turns=turns):
         raise BadInput(
             f"at the {name} the cables can hold the platform, but not accelerate it by its motion"
             f" limits: the capacity margin is {has} N, required {needs} N",
             where=f"scene {name}",
-            next_step=f"{GENTLER}, or move the {name} to a larger margin (`cdpr workspace` maps"
-            f" it), or {remedy(*binding)}",
+            next_step=f"{GENTLER}, or {larger}",
             values=values,
         )
     if margin >= 0.0:
@@ -290,8 +292,7 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose, *, turns: b
             where=f"scene {name}",
             why=f"with less than {MARGIN_RESERVE:.1%} of max_tension_n, or half of it beyond the"
             " force of the motion's acceleration, feasibility between poses is seldom proved",
-            next_step=f"move the {name} to a larger margin (`cdpr workspace` maps it),"
-            f" {remedy(*binding)}, or give waypoints to `cdpr.plan_from_waypoints`, which keeps no"
+            next_step=f"{larger}, or give waypoints to `cdpr.plan_from_waypoints`, which keeps no"
             " reserve",
             values=values,
         )

@@ -160,10 +160,8 @@ class MultiCameraMonitor:
             self.news.append(CameraNews("camera_sees_nothing", text))
 
 
-#: Largest wait for the last images at the end of a run, [s].
-PATIENCE = 20.0
-#: The same after the operator's stop, and the interval of checks for a stop, [s].
-HURRY, ROUND = 2.0, 0.05
+#: Largest wait for the last images at the end of a run, and after a stop; interval of checks, [s].
+PATIENCE, HURRY, ROUND = 20.0, 2.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -416,15 +414,19 @@ class CameraWatch:
         if all_failed:
             self._stop("stopping", all_failed, "camera", all_failed)
 
+    def _must_hurry(self) -> bool:
+        """Whether a stop shortens the wait for images; not that of a listener that raised."""
+        now = self._board.read()
+        return now.stop and (now.for_what is None or now.for_what.code != "recorder")
+
     def finish(self, at: float) -> CameraRecords:
         """Waits for the last images.
 
         Args:
             at: The end of the run, on the loop's clock, [s].
         """
-        read = self._board.read
-        with self._listener.waiting("waiting for the last images"):  # if it raises, it asks to stop
-            seen = self._cameras.finish(lambda: (now := read()).stop and now.for_what is None)
+        with self._listener.waiting("waiting for the last images"):
+            seen = self._cameras.finish(self._must_hurry)
         self._report_news(at)
         for camera in seen.cameras:
             if camera.dropped:

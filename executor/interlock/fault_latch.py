@@ -238,10 +238,16 @@ class FaultLatch:
             self.let_go()
 
     def disengage(self) -> None:
-        """Disengages the latch: drives may be moved again."""
+        """Disengages the latch: drives may be moved again.
+
+        A fault of another rig where it was before stays: its drives were not checked.
+        """
+        latched = self.read()
         try:
             for path in (*self._earlier, self.path):
-                path.unlink(missing_ok=True)
+                with suppress(FileNotFoundError):
+                    if path == self.path or latched is None or self._read(path).rig == latched.rig:
+                        path.unlink()
         except OSError as error:
             raise self._not_kept(error.strerror) from None
         self.let_go()

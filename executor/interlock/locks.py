@@ -347,8 +347,14 @@ class ControlLock:
     """
 
     def __init__(self, settings: BusSettings) -> None:
-        """Opens nothing yet."""
+        """Opens nothing yet.
+
+        Raises:
+            Refused: The user has no folder for the locks.
+        """
         self._settings, self._is_shared = settings, settings.interface != IN_PROCESS
+        if self._is_shared:
+            state_folders()
         self._held: int | None = None
         self._lock = threading.Lock()
 

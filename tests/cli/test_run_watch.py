@@ -60,10 +60,10 @@ def test_too_little_clearance_stops_the_run(names: list[str], who: str) -> None:
     assert not board.read().stop
 
 
-@pytest.mark.parametrize(("stop", "waits"), [("listener", True), ("operator", False)])
-def test_the_wait_for_the_last_images_is_cut_short_by_the_operator_alone(
-    stop: str, waits: bool
-) -> None:
+@pytest.mark.parametrize(
+    ("stop", "waits"), [("listener", True), ("operator", False), ("clearance_low", False)]
+)
+def test_the_wait_for_the_last_images_is_cut_short_by_stops_alone(stop: str, waits: bool) -> None:
     """A listener that raises ends no wait: the images of real time would be missing."""
     board, asked = LocalRequests(), list[bool]()
 
@@ -72,8 +72,8 @@ def test_the_wait_for_the_last_images_is_cut_short_by_the_operator_alone(
             raise RuntimeError(f"the display is gone: {text}")
 
     def finish(stopped: Callable[[], bool]) -> CameraRecords:
-        if stop == "operator":
-            board.ask_stop()
+        if stop != "listener":
+            board.ask_stop(None if stop == "operator" else StopReason(stop, "near"))
         asked.append(stopped())
         return CameraRecords()
 

@@ -19,7 +19,13 @@ from drivers.can_bus import BusSettings
 from executor.interlock import locks as state_folder
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
-from executor.interlock.locks import LARGEST_FILE, SetUpLock, read_state_file, state_file
+from executor.interlock.locks import (
+    LARGEST_FILE,
+    ControlLock,
+    SetUpLock,
+    read_state_file,
+    state_file,
+)
 from executor.interlock.reference import ReferenceFile, as_in_the_file
 from executor.state_machine import State
 from model import jit as machine_code
@@ -415,6 +421,23 @@ def test_a_serial_adapter_keeps_latch_and_reference_filed_under_its_device(
     FaultLatch(bus).require_disengaged()
 
 
+def test_a_reset_keeps_the_fault_of_another_rig_under_a_former_device(
+    adapters: UsbAdapters, tmp_path: Path
+) -> None:
+    """Its adapter had this device before: nobody has looked at its drives."""
+    channel = str(adapters.dev / "ttyACM0")
+    former, bus = BusSettings("slcan", f"-{channel}"), BusSettings("slcan", channel)
+    adapters.plug_in("ttyACM0", "4.2", "207C3")
+    FaultLatch(bus).engage("this", tmp_path, "a cable broke")
+    FaultLatch(former).engage("other", tmp_path, "a drive is silent")
+    latch = FaultLatch(bus)
+    with latch.held_for_reset("this", latch.read()):
+        pass
+    left = FaultLatch(bus).read()
+    assert left is not None
+    assert (left.rig, left.cause) == ("other", "a drive is silent")
+
+
 def test_state_of_a_serial_device_without_usb_is_written_and_kept(tmp_path: Path) -> None:
     """Its name is the same as before: what is written must not be removed as the former one."""
     device = tmp_path / "ttyS0"
@@ -498,4 +521,6 @@ def test_a_user_without_a_home_is_told_what_to_set(monkeypatch: pytest.MonkeyPat
     with pytest.raises(Refused) as refusal:
         state_file("latched", BUS)
     assert "XDG_STATE_HOME" in refusal.value.next_step
+    with pytest.raises(Refused, match="no folder for latched faults"):
+        ControlLock(BUS)  # at once, as a console would show nothing
     assert machine_code.use_folder("0123456789abcdef") is None

@@ -18,11 +18,11 @@ from model.jit import KernelSet, compilation, is_compiled
 from model.plan import plan_from_document
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
-from model.scene import empty_scene
+from model.scene import empty_scene, scene_from_document
 from planner import planning
 from planner.check import verify
 from planner.check_report import PlanRejected
-from planner.costs import capacity_margins
+from planner.costs import capacity_margins, margin_reserve
 from planner.endpoints import require_usable_ends
 from planner.path import Route
 from planner.planning import make_plan, plan_from_waypoints, plan_path
@@ -239,6 +239,23 @@ def test_an_end_that_only_lacks_the_reserve_is_not_called_infeasible(gachon, sce
     with pytest.raises(PlanRejected, match="cannot accelerate the platform") as rejected:
         plan_from_waypoints(gachon, scene, [scene.start, scene.goal])
     assert "acceleration_mm_s2" in rejected.value.next_step
+
+
+def test_an_end_with_margin_for_a_plan_without_rotation_has_it_as_a_remedy(hall, ready_scene):
+    """What rotates needs more than twice the margin of what is carried level, on this robot."""
+    scene = ready_scene("hall_pillar")
+    reserves = [margin_reserve(hall, scene.load, turns=turns) for turns in (False, True)]
+    low, high, margin = 0.0, 600.0, np.inf
+    while not reserves[0] < margin < reserves[1]:
+        force = (low + high) / 2.0
+        load = scene.document.load.model_copy(update={"force_n": [force] * 3})
+        loaded = scene_from_document(scene.document.model_copy(update={"load": load}))
+        margin = capacity_margins(hall, loaded, scene.start.position[None, :], np.eye(3))[0]
+        low, high = (force, high) if margin > reserves[1] else (low, force)
+    with pytest.raises(BadInput, match="the cables can hold the platform") as caught:
+        require_usable_ends(hall, loaded, free_rotation=True)
+    assert "without rotation" in caught.value.next_step
+    require_usable_ends(hall, loaded)
 
 
 def test_cables_that_act_in_too_few_directions_are_named(
