@@ -17,6 +17,7 @@ from model.rig import Rig
 from model.scene import Load
 from model.statics.gravity import largest_lever
 from model.statics.wrench_sets import rms_anchor_radius, with_scaled_moments
+from model.winches import whole_lengths
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,8 +106,7 @@ def coasting_distance(
     anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
     cables = cables_to(rig, anchors)
     columns = with_scaled_moments(structure_matrix_of(cables, positions), radius)
-    behind = np.array([winch.drum_to_outlet for winch in rig.winches])
-    per_metre = rig.cable_stiffness / (cables.lengths + behind)
+    per_metre = rig.cable_stiffness / whole_lengths(rig, cables.lengths)
     stiffness = (columns * per_metre[:, None, :]) @ columns.swapaxes(1, 2)
     weakest = float(np.linalg.eigvalsh(stiffness)[:, 0].min())
     if not (margin > 0.0 and weakest > 0.0):

@@ -43,6 +43,7 @@ from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from model.statics.gravity import working_tensions
+from model.winches import whole_lengths
 from planner.settings import whole_number
 from tracking.clearance import require_stated_errors
 
@@ -264,7 +265,7 @@ def _winding_in(
             next_step="check cables.stiffness_n, which is E·A in N, not E in Pa; or give a higher"
             " limit or a shorter reach; nothing was moved",
         )
-    lengths = cable_lengths(rig, pose) + [winch.drum_to_outlet for winch in rig.winches]
+    lengths = whole_lengths(rig, cable_lengths(rig, pose))
     stretch = lengths * targets / (rig.cable_stiffness + targets)
     return partial(
         PretensionLaw, targets=targets, limit=limit, reach=reach, speed=speed, stretch=stretch

@@ -28,6 +28,16 @@ from model.statics.gravity import weight_wrench, working_tensions
 _STEPS, _SETTLED, _DIFFERENCE = 60, 1e-9, 1e-6
 
 
+def whole_lengths(rig: Rig, lengths: Array) -> Array:
+    """Lengths of cables from drum to anchor, shape (..., m), [m].
+
+    Args:
+        rig: The robot.
+        lengths: From outlet to anchor, shape (..., m), [m].
+    """
+    return np.asarray(lengths + [winch.drum_to_outlet for winch in rig.winches])
+
+
 class WinchMap:
     """Unstrained cable lengths, strained lengths and drive counts of one rig."""
 

@@ -16,6 +16,7 @@ from executor.trajectory.time_scaling import PEAK, smooth_step
 from model.kinematics import cable_lengths
 from model.pose import Array
 from model.rig import Rig
+from model.winches import whole_lengths
 
 # Tension limits while winches move without a path: they slow down, and stop.
 
@@ -354,8 +355,7 @@ def wind_in_speed(rig: Rig, target: float | Array, limit: float, speed: float) -
 
 def _stiffness(rig: Rig) -> Array:
     """Cable stiffness at home, shape (m,), [N/m]."""
-    lengths = cable_lengths(rig, rig.home) + [winch.drum_to_outlet for winch in rig.winches]
-    return rig.cable_stiffness / lengths
+    return rig.cable_stiffness / whole_lengths(rig, cable_lengths(rig, rig.home))
 
 
 def _fastest(rig: Rig, speed: float) -> Array:

@@ -64,8 +64,8 @@ def state_folders() -> tuple[Path, ...]:
 def state_files(kind: str, settings: BusSettings) -> tuple[Path, ...]:
     """The file of a kind, such as ``latched``, for a bus; then where it was before, if readable.
 
-    Those of a serial adapter were named after its device, which may be another adapter's now: that
-    one is latched, too.
+    Those of a serial adapter were named after its device: they count for the adapter that is that
+    device now.
 
     Raises:
         HardwareMissing: The bus is that of a serial adapter which is not there, or of one of two
