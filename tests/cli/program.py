@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import io
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from pathlib import Path
 from unittest import mock
 
 from cdpr.cli import main
+from cdpr.cli.operate import supervision
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,16 @@ class Answer:
 
 
 def call(*arguments: str | Path, answers: str = "") -> Answer:
-    """Runs ``cdpr ARGUMENTS`` with ``answers`` as standard input."""
+    """Runs ``cdpr ARGUMENTS`` with ``answers`` as standard input.
+
+    The program counts as started now, not with the tests: a `cdpr stop` of another program since
+    then would stop every motion of theirs.
+    """
     out, err = io.StringIO(), io.StringIO()
     argv = ["cdpr", *map(str, arguments)]
+    now = time.clock_gettime(time.CLOCK_BOOTTIME)
     with (
+        mock.patch.object(supervision, "_process_start", return_value=now),
         mock.patch.object(sys, "argv", argv),
         mock.patch.object(sys, "stdin", io.StringIO(answers)),
         redirect_stdout(out),
