@@ -199,6 +199,7 @@ class CyclicGroup(ABC):
     """
 
     _cyclic: CyclicBus
+    _watch: GroupMonitor
 
     def __init__(self, rig: Rig, bus: can.BusABC, pump: Pump | None) -> None:
         """Takes an open bus and sends nothing yet; arguments as for `make_drive_group`."""
@@ -208,11 +209,6 @@ class CyclicGroup(ABC):
         self._max_steps = largest_steps(rig, rig.cycle)
         self._state = GroupState.OFFLINE
         self._faults: list[tuple[int, str]] = []
-
-    @property
-    @abstractmethod
-    def _listener(self) -> GroupMonitor:
-        """Processes frames of the drives."""
 
     @abstractmethod
     def _latch(self, found: list[tuple[int, str]]) -> None:
@@ -242,12 +238,12 @@ class CyclicGroup(ABC):
             self._pump()
             timeout_s = 0.0
         try:
-            self._cyclic.take_replies(self._listener, timeout_s)
+            self._cyclic.take_replies(self._watch, timeout_s)
             self._cyclic.end_cycle()
         except BusFault as fault:
             self._latch_bus(fault)
             raise
-        self._listener.end_cycle()
+        self._watch.end_cycle()
         self._check_faults()
         self._advance()
         return self._status()
@@ -263,7 +259,7 @@ class CyclicGroup(ABC):
             BusFault: The bus failed; the group is stopped.
         """
         try:
-            self._cyclic.discard_stale(self._listener)
+            self._cyclic.discard_stale(self._watch)
         except BusFault as fault:
             self._latch_bus(fault)
             raise

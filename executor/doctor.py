@@ -156,10 +156,10 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
     if not isinstance(drives, OdriveDocument):
         return []
     from drivers.odrive.endpoints import read_endpoints
-    from drivers.odrive.messages import OWN_DBC, read_layouts
+    from drivers.odrive.messages import read_layouts
 
     try:
-        read_layouts(Path(drives.dbc) if drives.dbc else OWN_DBC)
+        read_layouts(drives.dbc)
         if drives.endpoints is not None:
             read_endpoints(Path(drives.endpoints), drives)
     except BadInput as error:

@@ -25,7 +25,7 @@ from executor.proposals import Facts, Proposal, forget_proposal, homing_proposal
 from executor.realtime.scheduling import require_imported_script
 from executor.remote.command_server import commands_from_start
 from executor.supervision import RequestBoard, Supervisor
-from executor.winch_runs import WinchMotion, limit_of, move_by_law
+from executor.winch_runs import limit_of, move_by_law
 from model.errors import (
     BadInput,
     Refused,
@@ -163,12 +163,6 @@ def home(
     interlock = MotionInterlock(rig)
     made: list[HomingReference] = []
 
-    def at_rest(
-        result: WinchResult, true_pose: Pose | None, board: RequestBoard
-    ) -> HomingReference:
-        made.append(_referenced(rig, result, true_pose, board, known, source, pictures))
-        return made[0]
-
     lost_power = None
     if in_process:
         from simulation.ground_truth import PowerLoss  # a real bus loads no simulator
@@ -181,21 +175,27 @@ def home(
         fastest = float(wind_in_speed(rig, targets, limit, speed).max())
         proposal = homing_proposal(rig, targets, limit, reach, fastest, source)
         require_confirmed(confirm, proposal)
-        motion = WinchMotion(
-            rig=rig,
+
+        def at_rest(result: WinchResult, true_pose: Pose | None) -> HomingReference:
+            board = commands.board
+            made.append(_referenced(rig, result, true_pose, board, known, source, pictures))
+            return made[0]
+
+        move_by_law(
+            rig,
+            commands,
+            law,
+            "home",
             pose=known or rig.home,
             limit=limit,
             speed=speed,
-            make_law=law,
-            lost_power=lost_power,
             realtime=realtime,
             need_real_time_rights=need_real_time_rights,
-            rehome=True,
-            name="home",
             listener=listener,
-            commands=commands,
+            lost_power=lost_power,
+            rehome=True,
+            at_rest=at_rest,
         )
-        move_by_law(motion, at_rest)
     (reference,) = made
     return HomeResult(reference, None if in_process else interlock.file.path)
 

@@ -22,7 +22,7 @@ from executor.run_result import folder_maker
 from executor.runner import RunOptions, RunResult, run_prepared
 from executor.supervision import Supervisor
 from executor.trajectory.setpoints import prepare_plan
-from executor.winch_runs import WinchMotion, limit_of, move_by_law
+from executor.winch_runs import limit_of, move_by_law
 from model.errors import (
     BadInput,
     Refused,
@@ -331,20 +331,17 @@ def jog_cable(
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
         require_confirmed(confirm, cable_proposal(slow, cable, length, limit, fastest))
-        motion = WinchMotion(
-            rig=slow,
+        result = move_by_law(
+            slow,
+            commands,
+            partial(CableStep, cable=cable - 1, length=length, limit=limit, speed=fastest),
+            "jog-cable",
             pose=slow.home,
             limit=limit,
             speed=fastest,
-            make_law=partial(CableStep, cable=cable - 1, length=length, limit=limit, speed=fastest),
-            lost_power=None,
             realtime=realtime,
             need_real_time_rights=need_real_time_rights,
-            rehome=False,
-            name="jog-cable",
             listener=listener,
-            commands=commands,
         )
-        result = move_by_law(motion, lambda _result, _true_pose, _board: None)
     moved = (result.counts - result.began)[cable - 1] / winch.counts_per_metre
     return CableJog(cable, float(moved), result.tensions)

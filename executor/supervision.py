@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, TypeVar
 
+from executor.state_machine import CycleRecord, LoopEvent
 from model.errors import CdprError, Fault, StoppedByOperator
 from model.progress import Advance, Listener
 
@@ -70,6 +71,21 @@ class RequestBoard(Protocol):
 
     def read(self) -> OperatorRequests:
         """Present requests."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SupervisorCalls:
+    """Calls of a loop to its supervisor.
+
+    Attributes:
+        requests: Returns the operator's requests, read every cycle.
+        on_cycle: Takes every cycle; must return quickly.
+        on_event: Takes every event.
+    """
+
+    requests: Callable[[], OperatorRequests]
+    on_cycle: Callable[[CycleRecord], None]
+    on_event: Callable[[LoopEvent], None]
 
 
 class LocalRequests:

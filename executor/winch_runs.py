@@ -9,21 +9,26 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
-from executor.control.winch_motion import WinchRecord, WinchResult, move_winches, recording
+from executor.control.winch_motion import (
+    AtRest,
+    WinchRecord,
+    WinchResult,
+    move_winches,
+    nothing_at_rest,
+    recording,
+)
 from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_drives_of
 from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
-from executor.interlock.reference import HomingReference
 from executor.kernels import ready_for_simulating_process
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.process import real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
-from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import free_folder
 from executor.remote.command_server import Commands
 from executor.remote.status import WinchStatus
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
-from executor.supervision import LocalRequests, RequestBoard
+from executor.supervision import LocalRequests
 from model.errors import Fault, Refused, StoppedByOperator, real_number
 from model.pose import Pose
 from model.progress import Listener
@@ -36,43 +41,6 @@ if TYPE_CHECKING:
 LIMIT_SHARE = 0.6
 #: Events of every motion, one for defect reports, and one that the listener gets as a remark.
 _UNREPORTED = frozenset({"enabled", "moving", "held", "traceback", REMARK})
-
-AtRest = Callable[[WinchResult, Pose | None, RequestBoard], HomingReference | None]
-"""Called after a finished motion with its result, the simulated platform's pose and the requests;
-the reference it returns is kept if the drives held throughout."""
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class WinchMotion:
-    """A requested winch motion.
-
-    Attributes:
-        rig: The robot and its bus.
-        pose: Approximate pose of its platform, ``world_from_platform``.
-        limit: Largest tension, [N].
-        speed: Fastest winch, [m/s].
-        make_law: See `MakeLaw`; picklable.
-        lost_power: Effect of a power loss on simulated drives.
-        realtime: False for simulated time.
-        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
-        rehome: The drives are referenced again afterwards.
-        name: Of the record folder in ``runs`` of a motion on a bus.
-        listener: Receives progress.
-        commands: Those taken since the start of the verb.
-    """
-
-    rig: Rig
-    pose: Pose
-    limit: float
-    speed: float
-    make_law: MakeLaw
-    lost_power: PowerLoss | None
-    realtime: bool
-    need_real_time_rights: bool
-    rehome: bool
-    name: str
-    listener: Listener
-    commands: Commands
 
 
 def limit_of(rig: Rig, limit: float | None) -> float:
@@ -95,11 +63,37 @@ def limit_of(rig: Rig, limit: float | None) -> float:
     return limit
 
 
-def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
+def move_by_law(
+    rig: Rig,
+    commands: Commands,
+    make_law: MakeLaw,
+    name: str,
+    *,
+    pose: Pose,
+    limit: float,
+    speed: float,
+    realtime: bool,
+    need_real_time_rights: bool,
+    listener: Listener,
+    lost_power: PowerLoss | None = None,
+    rehome: bool = False,
+    at_rest: AtRest = nothing_at_rest,
+) -> WinchResult:
     """Moves, in the real-time process or in simulated time; ends with the drives holding.
 
     Args:
-        motion: The motion.
+        rig: The robot and its bus.
+        commands: Those taken since the start of the verb.
+        make_law: See `MakeLaw`; picklable.
+        name: Of the record folder in ``runs`` of a motion on a bus.
+        pose: Approximate pose of its platform, ``world_from_platform``.
+        limit: Largest tension, [N].
+        speed: Fastest winch, [m/s].
+        realtime: False for simulated time.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        listener: Receives progress.
+        lost_power: Effect of a power loss on simulated drives.
+        rehome: The drives are referenced again afterwards.
         at_rest: See `AtRest`.
 
     Raises:
@@ -108,7 +102,24 @@ def move_by_law(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
         KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
         CdprError: Nothing was enabled.
     """
-    return supervised(motion.rig, motion.commands, partial(_move, motion, at_rest))
+
+    def move() -> WinchResult:
+        return move_supervised(
+            rig,
+            commands,
+            LawMotion(rig.cable_count, rig.cycle, make_law, limit, speed),
+            partial(unreferenced_drives_of, rig.document, pose, limit, lost_power),
+            WinchStatus(rig, commands.board, simulated_time=not realtime),
+            name,
+            clock=SimulatedClock(rig.cycle),
+            need_real_time_rights=need_real_time_rights,
+            listener=listener,
+            showing=_progress(listener),
+            rehome=rehome,
+            at_rest=at_rest,
+        )
+
+    return supervised(rig, commands, move)
 
 
 def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) -> WinchResult:
@@ -141,21 +152,6 @@ def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) ->
     return result
 
 
-def _move(motion: WinchMotion, at_rest: AtRest) -> WinchResult:
-    board = motion.commands.board
-    return move_supervised(
-        motion.rig,
-        motion.commands,
-        _mover(motion, board),
-        WinchStatus(motion.rig, board, simulated_time=not motion.realtime),
-        motion.name,
-        listener=motion.listener,
-        showing=_progress(motion.listener),
-        rehome=motion.rehome,
-        at_rest=lambda result, true_pose: at_rest(result, true_pose, board),
-    )
-
-
 @contextmanager
 def _progress(listener: Listener) -> Iterator[Callable[[CycleRecord], None]]:
     """Shows the progress of a law, which is the record's index."""
@@ -171,39 +167,58 @@ def _progress(listener: Listener) -> Iterator[Callable[[CycleRecord], None]]:
 def move_supervised(
     rig: Rig,
     commands: Commands,
-    mover: AbstractContextManager[WinchMover],
+    task: MotionTask,
+    make_drives: Callable[..., AbstractContextManager[ReadyDrives]],
     status: WinchStatus,
     name: str,
     *,
+    clock: Clock,
+    need_real_time_rights: bool,
     listener: Listener,
     showing: AbstractContextManager[Callable[[CycleRecord], None]],
     presses: PressBoard | None = None,
     unreported: Collection[str] = _UNREPORTED,
     rehome: bool = False,
-    at_rest: Callable[[WinchResult, Pose | None], HomingReference | None] = lambda _, __: None,
+    at_rest: AtRest = nothing_at_rest,
 ) -> WinchResult:
     """Moves while the command socket accepts requests such as `cdpr stop`, and records it.
 
     Args:
         rig: The robot.
         commands: Those taken since the start of the verb.
-        mover: See `winch_mover`.
+        task: For the drives.
+        make_drives: Opens them; takes a `listener` where it is called in this process.
         status: Answers on the command socket.
         name: Of the record folder in ``runs``; simulated drives leave none.
+        clock: For simulated time.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives events.
         showing: Called after every cycle, before the status.
         presses: Where the command socket writes held controls.
         unreported: Codes of events that the listener does not get.
         rehome: The drives are referenced again afterwards.
-        at_rest: See `move_winches`.
+        at_rest: See `AtRest`.
     """
-    interlock = MotionInterlock(rig)
+    interlock, board, simulated = MotionInterlock(rig), commands.board, is_simulated(rig)
     with ExitStack() as stack:
         stack.enter_context(commands.during_motion(status, presses))
-        moving = stack.enter_context(mover)
-        log = stack.enter_context(
-            nullcontext() if is_simulated(rig) else recording(free_folder(name))
-        )
+        moving: WinchMover
+        if isinstance(board, LocalRequests):
+            drives = stack.enter_context(make_drives(listener=listener))
+            moving = WinchesHere(task, drives, clock, board)
+        else:
+            if simulated:
+                ready_for_simulating_process(listener)
+            process = real_time_process(
+                task,
+                make_drives,
+                board,
+                need_real_time=need_real_time_rights and not simulated,
+                check_drives=partial(abandoned_drives_fault, rig.document),
+                listener=listener,
+            )
+            moving = stack.enter_context(process)
+        log = stack.enter_context(nullcontext() if simulated else recording(free_folder(name)))
         if log is not None:
             status.take_folder(log.folder)
         result = move_winches(
@@ -217,61 +232,6 @@ def move_supervised(
         )
         status.take_end(result.state, result.cause)
     return result
-
-
-def _mover(
-    motion: WinchMotion, board: LocalRequests | SharedRequests
-) -> AbstractContextManager[WinchMover]:
-    rig = motion.rig
-    return winch_mover(
-        rig,
-        LawMotion(rig.cable_count, rig.cycle, motion.make_law, motion.limit, motion.speed),
-        partial(unreferenced_drives_of, rig.document, motion.pose, motion.limit, motion.lost_power),
-        board,
-        clock=SimulatedClock(rig.cycle),
-        need_real_time_rights=motion.need_real_time_rights,
-        listener=motion.listener,
-    )
-
-
-@contextmanager
-def winch_mover(
-    rig: Rig,
-    task: MotionTask,
-    make_drives: Callable[..., AbstractContextManager[ReadyDrives]],
-    board: LocalRequests | SharedRequests,
-    *,
-    clock: Clock,
-    need_real_time_rights: bool,
-    listener: Listener,
-) -> Iterator[WinchMover]:
-    """Makes the mover of winches: the real-time process, or this one in simulated time.
-
-    Args:
-        rig: The robot and its bus.
-        task: For the drives.
-        make_drives: Opens them; takes a `listener` where it is called in this process.
-        board: Of operator requests.
-        clock: For simulated time.
-        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
-        listener: Receives progress.
-    """
-    if isinstance(board, LocalRequests):
-        with make_drives(listener=listener) as drives:
-            yield WinchesHere(task, drives, clock, board)
-        return
-    simulated = is_simulated(rig)
-    if simulated:
-        ready_for_simulating_process(listener)
-    with real_time_process(
-        task,
-        make_drives,
-        board,
-        need_real_time=need_real_time_rights and not simulated,
-        check_drives=partial(abandoned_drives_fault, rig.document),
-        listener=listener,
-    ) as process:
-        yield process
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from enum import Enum
@@ -27,9 +27,6 @@ from simulation.ground_truth import (
     winches_as_built,
 )
 from simulation.plant import Plant
-
-# From the motors to the platform and back: drums follow motors, torques follow tensions.
-
 
 # Transmission between motor and drum: backlash and steps. Pure.
 
@@ -90,104 +87,6 @@ class WinchDrive(Protocol):
         ...
 
 
-class DriveTrain:
-    """Moves the platform to the motors' positions, and sets the drives' torques.
-
-    Updates run step by step to allow other work in between, as finding the equilibrium may take
-    long.
-
-    Attributes:
-        per_newton: Torque by tension, shape (m,), in the unit of the drives' protocol.
-    """
-
-    def __init__(
-        self, rig: Rig, plant: Plant, counts: Array, per_newton: Array, friction: float = 0.0
-    ) -> None:
-        """Moves the platform to the equilibrium for given positions of the motors.
-
-        Args:
-            rig: The robot, with the ``simulation`` section of its file.
-            plant: What the drums move.
-            counts: Positions of the motors, shape (m,), [counts].
-            per_newton: Torque by tension, shape (m,), in the unit of the drives' protocol.
-            friction: Friction torque of a drive train, in that unit.
-
-        Raises:
-            Fault: The platform has no equilibrium there.
-        """
-        self._plant, self._counts, self.per_newton = plant, counts, per_newton
-        winches = winches_as_built(rig)
-        per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
-        play = per_metre * winches.backlash_mm / 1000.0
-        self._transmission = Transmission(play, winches.step_counts, counts)
-        plant.settle_counts(self._transmission.drums(counts))
-        self._tension_noise = winches.tension_noise_n
-        self._random = np.random.default_rng([simulation_of(rig).seed, 0x7E45])
-        self._friction, self._ahead = friction, np.zeros(len(counts))
-        self._update: Iterator[None] | None = None
-
-    @property
-    def is_updating(self) -> bool:
-        """Whether an update of the torques is in progress."""
-        return self._update is not None
-
-    def begin_update(self, drives: Sequence[WinchDrive]) -> None:
-        """Begins an update of the torques, unless one is in progress."""
-        if self._update is None:
-            self._update = self._updating(drives)
-
-    def continue_update(self) -> None:
-        """Makes one step of an update in progress.
-
-        Raises:
-            Fault: The platform has no equilibrium.
-        """
-        if self._update is None:
-            return
-        try:
-            next(self._update)
-        except StopIteration:
-            self._update = None
-
-    def finish_update(self) -> None:
-        """Makes all remaining steps; errors as for `continue_update`."""
-        while self._update is not None:
-            self.continue_update()
-
-    def settle(self, drives: Sequence[WinchDrive]) -> None:
-        """Moves the platform to its equilibrium, if any drum has moved.
-
-        Raises:
-            Fault: The platform has no equilibrium.
-        """
-        counts = _positions(drives)
-        if not np.array_equal(counts, self._counts):
-            self._plant.settle_counts(self._transmission.drums(counts))
-            self._counts = counts
-
-    def _updating(self, drives: Sequence[WinchDrive]) -> Iterator[None]:
-        """Moves the platform to its equilibrium, then sets the torques."""
-        counts = _positions(drives)
-        if not np.array_equal(counts, self._counts):
-            yield from self._plant.settling_counts(self._transmission.drums(counts))
-            if self._friction > 0.0:  # a motor at rest keeps its last friction torque
-                moved = np.sign(counts - self._counts)
-                self._ahead = np.where(moved == 0.0, self._ahead, moved)
-            self._counts = counts
-        tensions = self._plant.tensions
-        if self._tension_noise > 0.0:
-            noise = self._random.standard_normal(len(tensions))
-            tensions = tensions + self._tension_noise * noise
-        torques = tensions * self.per_newton + self._friction * self._ahead
-        for drive, torque in zip(drives, torques.tolist(), strict=True):
-            drive.torque = torque if drive.torque_on else 0.0
-
-
-def _positions(drives: Sequence[WinchDrive]) -> Array:
-    """Positions of the motors, shape (m,), [counts]."""
-    return np.array([drive.motor.position for drive in drives])
-
-
 Frame = bytes | bytearray
 
 TOP_SPEED_RESERVE = 1.5
@@ -220,10 +119,14 @@ Drive = TypeVar("Drive", bound=WinchDrive)
 class SimulatedRig(ABC, Generic[Drive]):
     """Simulated drives and their platform on one end of a CAN bus.
 
+    Drums follow the motors, and the drives' torques follow the tensions. Updates of the torques run
+    step by step to allow other work in between, as finding the equilibrium may take long.
+
     Attributes:
         drives: In the order of the winches.
         plant: What they move.
         cycles: Number of cycles.
+        per_newton: Torque by tension, shape (m,), in the unit of the drives' protocol.
     """
 
     def __init__(
@@ -242,15 +145,25 @@ class SimulatedRig(ABC, Generic[Drive]):
 
         Raises:
             TensionInfeasible: The cables cannot hold the platform there.
-            Fault: The bus did not accept the drives' first frames.
+            Fault: The bus did not accept the drives' first frames, or the platform has no
+                equilibrium there.
         """
         self._rig, self._bus = rig, bus
         self._cycle = rig.cycle
         self.plant = Plant(rig_as_built(rig), start_pose, load, stiffness_as_built(rig))
         self.cycles = 0
-        per_newton = self._torque_per_newton()
+        self.per_newton = self._torque_per_newton()
         start = WinchMap(rig).counts_at(start_pose, load)
-        self._drive_train = DriveTrain(rig, self.plant, start, per_newton, self._friction())
+        winches = winches_as_built(rig)
+        per_metre = np.array([winch.counts_per_metre for winch in rig.winches])
+        play = per_metre * winches.backlash_mm / 1000.0
+        self._transmission = Transmission(play, winches.step_counts, start)
+        self.plant.settle_counts(self._transmission.drums(start))
+        self._tension_noise = winches.tension_noise_n
+        self._random = np.random.default_rng([simulation_of(rig).seed, 0x7E45])
+        self._counts, self._ahead = start, np.zeros(len(start))
+        self._friction_torque = self._friction()
+        self._update: Iterator[None] | None = None
         self.drives: tuple[Drive, ...] = ()
         self.drives = tuple(
             self._make_drive(number, float(counts), self._top_speed(number))
@@ -351,8 +264,8 @@ class SimulatedRig(ABC, Generic[Drive]):
                     wait = 0.0
                     continue
                 wait = IDLE_WAIT
-                if self._drive_train.is_updating:
-                    self._drive_train.continue_update()
+                if self._update is not None:
+                    self._continue_torque_update(self._update)
                     wait = clock() - now  # leaves half of the processor to a master
                 if on_status is not None and now - reported >= status_period:
                     reported = now
@@ -382,13 +295,57 @@ class SimulatedRig(ABC, Generic[Drive]):
             drive.advance(elapsed)
 
     def _begin_torque_update(self) -> None:
-        self._drive_train.begin_update(self.drives)
+        """Begins an update of the torques, unless one is in progress."""
+        if self._update is None:
+            self._update = self._updating()
+
+    def _continue_torque_update(self, update: Iterator[None]) -> None:
+        """Makes one step of the update in progress.
+
+        Raises:
+            Fault: The platform has no equilibrium.
+        """
+        try:
+            next(update)
+        except StopIteration:
+            self._update = None
 
     def _finish_torque_update(self) -> None:
-        self._drive_train.finish_update()
+        """Makes all remaining steps; errors as for `_continue_torque_update`."""
+        while self._update is not None:
+            self._continue_torque_update(self._update)
 
     def _settle(self) -> None:
-        self._drive_train.settle(self.drives)
+        """Moves the platform to its equilibrium, if any drum has moved.
+
+        Raises:
+            Fault: The platform has no equilibrium.
+        """
+        counts = self._positions()
+        if not np.array_equal(counts, self._counts):
+            self.plant.settle_counts(self._transmission.drums(counts))
+            self._counts = counts
+
+    def _updating(self) -> Iterator[None]:
+        """Moves the platform to its equilibrium, then sets the torques."""
+        counts = self._positions()
+        if not np.array_equal(counts, self._counts):
+            yield from self.plant.settling_counts(self._transmission.drums(counts))
+            if self._friction_torque > 0.0:  # a motor at rest keeps its last friction torque
+                moved = np.sign(counts - self._counts)
+                self._ahead = np.where(moved == 0.0, self._ahead, moved)
+            self._counts = counts
+        tensions = self.plant.tensions
+        if self._tension_noise > 0.0:
+            noise = self._random.standard_normal(len(tensions))
+            tensions = tensions + self._tension_noise * noise
+        torques = tensions * self.per_newton + self._friction_torque * self._ahead
+        for drive, torque in zip(self.drives, torques.tolist(), strict=True):
+            drive.torque = torque if drive.torque_on else 0.0
+
+    def _positions(self) -> Array:
+        """Positions of the motors, shape (m,), [counts]."""
+        return np.array([drive.motor.position for drive in self.drives])
 
     def _send(self, can_id: int, data: Frame) -> None:
         with suppress(BusDown):  # no node is reached

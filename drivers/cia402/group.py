@@ -69,6 +69,8 @@ FIRST_READING_TIMEOUT = 0.1
 class Cia402Group(CyclicGroup):
     """CiA 402 drives in cyclic synchronous position mode; see `drivers.drive_group.DriveGroup`."""
 
+    _watch: DriveMonitor
+
     def __init__(
         self, rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None
     ) -> None:
@@ -131,10 +133,6 @@ class Cia402Group(CyclicGroup):
             * cycles_to_end(self._heartbeats, self._requests, self._answer_cycles),
             simulated=self._simulated,
         )
-
-    @property
-    def _listener(self) -> DriveMonitor:
-        return self._watch
 
     @property
     def restarted(self) -> tuple[int, ...]:

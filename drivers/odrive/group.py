@@ -12,7 +12,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 from enum import Enum, auto
-from pathlib import Path
 
 import can
 import numpy as np
@@ -32,7 +31,6 @@ from drivers.drive_group import (
 )
 from drivers.odrive.configure import configure_drives
 from drivers.odrive.messages import (
-    OWN_DBC,
     RESULT_TEXTS,
     AxisState,
     OdriveFrames,
@@ -73,6 +71,8 @@ class _Stop(Enum):
 class OdriveGroup(CyclicGroup):
     """ODrives in position control; see `drivers.drive_group.DriveGroup`."""
 
+    _watch: OdriveMonitor
+
     def __init__(
         self, rig: Rig, bus: can.BusABC, pump: Pump | None = None, *, max_tension: float | None
     ) -> None:
@@ -82,7 +82,7 @@ class OdriveGroup(CyclicGroup):
             raise TypeError("the rig has no ODrives")
         super().__init__(rig, bus, pump)
         self._document = document
-        self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
+        self._layouts = read_layouts(document.dbc)
         self._frames = OdriveFrames(rig, self._layouts)
         cycle = rig.cycle
         self._step_within = STEP_TIMEOUT + heartbeat_within(document)
@@ -119,10 +119,6 @@ class OdriveGroup(CyclicGroup):
             master_timeout=0.0,
             released_within=SETTLING + self._step_within + 1.0,
         )
-
-    @property
-    def _listener(self) -> OdriveMonitor:
-        return self._watch
 
     @property
     def restarted(self) -> tuple[int, ...]:
@@ -409,7 +405,7 @@ def read_axes(
     rig: Rig, document: OdriveDocument, bus: can.BusABC, pump: Pump | None, *, partial: bool = False
 ) -> DriveSnapshot:
     """State, position and torque of every axis; see `drivers.factory.read_drives`."""
-    layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
+    layouts = read_layouts(document.dbc)
     nodes = [winch.node_id for winch in rig.winches]
     cyclic = CyclicBus(bus, commanding_ids(nodes), foreign_master_message, is_command)
     watch = OdriveMonitor(rig, document, layouts, largest_steps(rig, rig.cycle))

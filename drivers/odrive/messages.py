@@ -108,13 +108,14 @@ class Layouts:
     get_torques: Layout
 
 
-def read_layouts(path: Path = OWN_DBC) -> Layouts:
+def read_layouts(file: Path | str | None = None) -> Layouts:
     """The layouts in a DBC file, by default the one beside this module.
 
     Raises:
         BadInput: cantools is not installed, the file cannot be read, or a message or signal is
             missing or not aligned to bytes.
     """
+    path = Path(file or OWN_DBC)
     database = _database(path)
     found = {name.lower(): _layout(database, name, path) for name in NEEDED}
     return Layouts(**{field.name: found[field.name] for field in fields(Layouts)})

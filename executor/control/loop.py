@@ -21,7 +21,13 @@ from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
-from executor.supervision import OperatorRequests, StopReason, in_one_line, record_failure
+from executor.supervision import (
+    OperatorRequests,
+    StopReason,
+    SupervisorCalls,
+    in_one_line,
+    record_failure,
+)
 from executor.trajectory.setpoints import CheckedSetpoints
 from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
@@ -39,27 +45,19 @@ class Loop:
     """A slack cable is a fault."""
 
     def __init__(
-        self,
-        checked: CheckedSetpoints,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
+        self, checked: CheckedSetpoints, master: SyncMaster, calls: SupervisorCalls
     ) -> None:
         """Prepares a run; nothing is sent yet.
 
         Args:
             checked: The checked set-points, with the rig they are for.
             master: Sends the cycles of configured drives.
-            requests: Operator requests, read every cycle.
-            on_cycle: Called after every cycle; must return quickly.
-            on_event: Called for every event.
+            calls: To the supervisor.
         """
         self.machine = Machine()
         self._checked, self._master = checked, master
         self._group, self._clock = master.group, master.clock
-        self._requests, self._on_cycle, self._on_event = requests, on_cycle, on_event
+        self._calls = calls
         self._sender = Cycle(checked, master, slack_counts=self.slack_counts)
         self._feed = Feed(len(checked), checked.cycle, checked.rig.motion)
         self._cycle = self._bus_faults = 0
@@ -172,7 +170,7 @@ class Loop:
                 return
         self.machine.on(Event.AT_START)
         self._report("moving", f"at the start; moving {self.motion_phrase}")
-        self._apply_requests(self._requests())
+        self._apply_requests(self._calls.requests())
 
     def _follow(self) -> None:
         """One cycle along the table, or at rest in it."""
@@ -231,7 +229,7 @@ class Loop:
         self._handle_alarms(done.alarms)
         # A fault stops the drives at once; operator requests count up to the next cycle.
         self._clock.wait_to_decide()
-        requests = self._requests()
+        requests = self._calls.requests()
         if requests.lost:
             self._handle_alarms((Alarm(StopReaction.PATH_STOP, "supervisor_lost", requests.lost),))
         self._apply_requests(requests)
@@ -259,7 +257,7 @@ class Loop:
             press=self._press,
         )
         self._cycle += 1
-        self._call_listener(lambda: self._on_cycle(record))
+        self._call_listener(lambda: self._calls.on_cycle(record))
 
     def _is_held(self, status: CycleStatus) -> bool:
         """Whether no drive has let go of a cable that it held, before or in this motion."""
@@ -429,7 +427,7 @@ class Loop:
 
     def _report(self, code: str, text: str) -> None:
         event = LoopEvent(self._cycle, self._clock.time, code, text)
-        self._call_listener(lambda: self._on_event(event))
+        self._call_listener(lambda: self._calls.on_event(event))
 
 
 _ACTIVE = ON_PATH | {State.ENABLING, State.APPROACHING, State.SECURING}

@@ -20,8 +20,8 @@ from executor.realtime.process import CheckDrives, real_time_process
 from executor.realtime.scheduling import Clock
 from executor.realtime.shared_memory import SharedMemory, SharedRequests
 from executor.recording.recorder import Recorder, RunLog
-from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
-from executor.supervision import OperatorRequests, RequestBoard
+from executor.state_machine import ON_PATH, CycleRecord, State
+from executor.supervision import RequestBoard, SupervisorCalls
 from executor.trajectory.dwell import Schedule, load_changes
 from executor.trajectory.setpoints import CheckedSetpoints, PreparedRun, checked_setpoints_of
 from model.errors import CdprError
@@ -79,23 +79,9 @@ class PathMotion(MotionTask):
         numbers = np.frombuffer(self.setpoints.view, dtype=np.int32)
         return CheckedSetpoints(rig, self.cycle, numbers.reshape(-1, rig.cable_count), self.hash)
 
-    def loop(
-        self,
-        drives: ReadyDrives,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> Loop:
+    def loop(self, drives: ReadyDrives, master: SyncMaster, calls: SupervisorCalls) -> Loop:
         """See `MotionTask`."""
-        return Loop(
-            self.checked_setpoints(),
-            master,
-            requests=requests,
-            on_cycle=on_cycle,
-            on_event=on_event,
-        )
+        return Loop(self.checked_setpoints(), master, calls)
 
     def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:
         """See `MotionTask`."""
@@ -175,9 +161,7 @@ def run_in_process(
     loop = Loop(
         checked_setpoints_of(prepared.checked),
         SyncMaster(prepared.rig, group, clock),
-        requests=board.read,
-        on_cycle=on_cycle,
-        on_event=recorder.take_event,
+        SupervisorCalls(board.read, on_cycle, recorder.take_event),
     )
     loop.arm()
     before_motion()

@@ -19,7 +19,7 @@ from executor.interlock.interlock import MotionInterlock
 from executor.realtime.child import Armed, Ended, MotionTask, ReadyDrives
 from executor.realtime.process import RealTimeProcess
 from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.supervision import OperatorRequests
+from executor.supervision import OperatorRequests, SupervisorCalls
 from model.errors import CdprError, Fault, StoppedByOperator
 from model.pose import Pose
 from model.rig import Rig
@@ -263,17 +263,9 @@ class StandstillMotion(MotionTask):
         """The procedure for the drives of a rig."""
         return cls(rig.cable_count, rig.cycle, kind)
 
-    def loop(
-        self,
-        drives: ReadyDrives,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> Standstill:
+    def loop(self, drives: ReadyDrives, master: SyncMaster, calls: SupervisorCalls) -> Standstill:
         """See `MotionTask`."""
-        return self.kind(drives.rig, master, requests, on_cycle)
+        return self.kind(drives.rig, master, calls.requests, calls.on_cycle)
 
 
 # In the real-time process, with their effect on latch and reference.

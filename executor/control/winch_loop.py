@@ -23,8 +23,8 @@ from executor.control.winch_laws import WinchLaw
 from executor.realtime.child import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
 from executor.realtime.scheduling import Clock
 from executor.safety.gate import Purpose
-from executor.state_machine import CycleRecord, Event, LoopEvent, State
-from executor.supervision import OperatorRequests, RequestBoard
+from executor.state_machine import Event, State
+from executor.supervision import RequestBoard, SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.errors import Refused, StoppedByOperator
 from model.rig import Rig
@@ -39,21 +39,12 @@ class WinchLoop(Loop):
     motion_phrase = "together"
     slack_counts = False
 
-    def __init__(
-        self,
-        rig: Rig,
-        law: WinchLaw,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> None:
+    def __init__(self, rig: Rig, law: WinchLaw, master: SyncMaster, calls: SupervisorCalls) -> None:
         """Prepares the motion; arguments as for `Loop`, with a law instead of set-points."""
         cycle = rig.cycle
         reach = np.array(law.reach, dtype=np.int32)
         checked = CheckedSetpoints(rig, cycle, reach, fingerprint(cycle, reach))
-        super().__init__(checked, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
+        super().__init__(checked, master, calls)
         self._law = law
         self._feed = Feed(_ENDLESS, cycle, rig.motion)
         self._status: CycleStatus | None = None
@@ -121,20 +112,12 @@ class LawMotion(MotionTask):
     limit: float
     speed: float
 
-    def loop(
-        self,
-        drives: ReadyDrives,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> Loop:
+    def loop(self, drives: ReadyDrives, master: SyncMaster, calls: SupervisorCalls) -> Loop:
         """See `MotionTask`."""
         rig = with_reduced_limits(drives.rig, limit=self.limit, speed=self.speed)
         law = self.make_law(rig, master.read_positions().positions.tolist())
         _require_reach_allowed(drives.rig, law)
-        return WinchLoop(rig, law, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
+        return WinchLoop(rig, law, master, calls)
 
 
 def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:
@@ -180,13 +163,12 @@ class WinchesHere:
             CdprError: The drives cannot be armed.
             StoppedByOperator: A stop was requested before anything moved.
         """
-        self._loop = self._motion.loop(
-            self._drives,
-            self._master,
+        calls = SupervisorCalls(
             requests=self._board.read,
             on_cycle=lambda record: records.take_cycle(record, None),
             on_event=records.take_event,
         )
+        self._loop = self._motion.loop(self._drives, self._master, calls)
         self._loop.arm(partial(self._motion.require, self._drives))
         if self._board.read().stop:
             raise StoppedByOperator("stopped before anything moved")

@@ -53,6 +53,15 @@ class WinchResult:
     tensions: Array
 
 
+AtRest = Callable[[WinchResult, Pose | None], HomingReference | None]
+"""Called after a finished motion, while the drives are locked, with its result and the true pose of
+the simulated platform; the reference it returns is kept if the drives held throughout."""
+
+
+def nothing_at_rest(_result: WinchResult, _true_pose: Pose | None) -> None:
+    """Takes no reference; an `AtRest`."""
+
+
 def require_held(rig: Rig, result: WinchResult, found: CycleStatus) -> None:
     """Requires the drives to hold at the positions where the motion ended.
 
@@ -118,7 +127,7 @@ def move_winches(
     *,
     record: Path,
     rehome: bool,
-    at_rest: Callable[[WinchResult, Pose | None], HomingReference | None],
+    at_rest: AtRest,
 ) -> WinchResult:
     """Moves by a law; always ends with the drives holding on their own.
 
@@ -129,8 +138,7 @@ def move_winches(
         records: Takes cycles and events.
         record: Path that the latch names if the motion does not finish.
         rehome: The drives must be homed again afterwards.
-        at_rest: Called after a finished motion, while the drives are locked, with the true pose of
-            the simulated platform; the reference it returns is kept if the drives held throughout.
+        at_rest: See `AtRest`.
 
     Raises:
         Refused: The bus is latched, or the drives are not where the law begins; nothing was

@@ -30,8 +30,8 @@ from executor.hold_to_run.presses import CablePress, Press, PressReader, PressSt
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
-from executor.state_machine import CycleRecord, Event, LoopEvent, State
-from executor.supervision import OperatorRequests
+from executor.state_machine import CycleRecord, Event, State
+from executor.supervision import OperatorRequests, SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.rig import Rig
 from model.winches import WinchMap
@@ -87,11 +87,9 @@ class CableLoop(Loop):
         begin: Sequence[int],
         limits: CableLimits,
         master: SyncMaster,
+        calls: SupervisorCalls,
         *,
         held: Callable[[], PressState],
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
     ) -> None:
         """Prepares the session; sends nothing yet.
 
@@ -100,15 +98,13 @@ class CableLoop(Loop):
             begin: Positions of the drives, [counts].
             limits: Of each press.
             master: See `Loop`.
+            calls: See `Loop`; of the requests only a stop counts.
             held: Returns the press held now; called every cycle.
-            requests: See `Loop`; only a stop counts.
-            on_cycle: See `Loop`.
-            on_event: See `Loop`.
         """
         cycle = rig.cycle
         here = np.array([begin], dtype=np.int32)
         checked = CheckedSetpoints(rig, cycle, here, fingerprint(cycle, here))
-        super().__init__(checked, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
+        super().__init__(checked, master, calls)
         self._rig, self._limits, self._held_now = rig, limits, held
         self._feed = self._feed_at(0.0)
         self._status: CycleStatus | None = None
@@ -211,15 +207,7 @@ class CableMotion(MotionTask):
     longest: float
     presses: SharedMemory
 
-    def loop(
-        self,
-        drives: ReadyDrives,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> Loop:
+    def loop(self, drives: ReadyDrives, master: SyncMaster, calls: SupervisorCalls) -> Loop:
         """See `MotionTask`."""
         winches = WinchMap(drives.rig)
         positions = tuple(position_limits(drives.rig, k, winches) for k in range(self.cables))
@@ -228,10 +216,8 @@ class CableMotion(MotionTask):
             master.read_positions().positions.tolist(),
             CableLimits(self.limit, self.speed, self.longest, positions),
             master,
+            calls,
             held=PressReader(self.presses, lambda: master.clock.now).read,
-            requests=requests,
-            on_cycle=on_cycle,
-            on_event=on_event,
         )
 
 

@@ -22,8 +22,8 @@ from executor.interlock.reference import HomingReference
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
-from executor.state_machine import CycleRecord, Event, LoopEvent, State
-from executor.supervision import OperatorRequests
+from executor.state_machine import Event, State
+from executor.supervision import OperatorRequests, SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, Setpoints, fingerprint
 from model.errors import Fault
 from model.files.rig_file import RigDocument
@@ -44,25 +44,21 @@ class JogLoop(Loop):
         self,
         here: CheckedSetpoints,
         master: SyncMaster,
+        calls: SupervisorCalls,
         *,
         held: Callable[[], PressState],
         pieces: Callable[[], Iterable[Piece]],
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
     ) -> None:
         """Prepares the session; sends nothing yet.
 
         Args:
             here: One row: the positions at rest.
             master: See `Loop`.
+            calls: See `Loop`; of the requests only a stop counts.
             held: Returns the press held now; called every cycle.
             pieces: Returns pieces that arrived since the last call; called every cycle.
-            requests: See `Loop`; only a stop counts.
-            on_cycle: See `Loop`.
-            on_event: See `Loop`.
         """
-        super().__init__(here, master, requests=requests, on_cycle=on_cycle, on_event=on_event)
+        super().__init__(here, master, calls)
         self._held_now, self._pieces = held, pieces
         self._feed = Feed(1, here.cycle, here.rig.motion, rate=0.0)
         self._rows: Setpoints = here.setpoints
@@ -158,15 +154,7 @@ class JogMotion(MotionTask):
     pieces: SharedMemory
     reference: HomingReference | None
 
-    def loop(
-        self,
-        drives: ReadyDrives,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> Loop:
+    def loop(self, drives: ReadyDrives, master: SyncMaster, calls: SupervisorCalls) -> Loop:
         """See `MotionTask`."""
         row = np.array([self.begin], dtype=np.int32)
         rig = rig_from_document(self.rig)
@@ -174,11 +162,9 @@ class JogMotion(MotionTask):
         return JogLoop(
             here,
             master,
+            calls,
             held=PressReader(self.presses, lambda: master.clock.now).read,
             pieces=PieceRing(self.pieces, self.cables).take,
-            requests=requests,
-            on_cycle=on_cycle,
-            on_event=on_event,
         )
 
     def require(self, drives: ReadyDrives, seen: CycleStatus) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Protocol
+from typing import Any
 
 from executor.control.winch_motion import WinchResult
 from executor.drives import (
@@ -36,7 +36,7 @@ from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import CableStatus, JogStatus, SessionStatus
 from executor.state_machine import REMARK, CycleRecord
 from executor.supervision import RequestBoard, Supervisor
-from executor.winch_runs import limit_of, move_supervised, supervised, winch_mover
+from executor.winch_runs import limit_of, move_supervised, supervised
 from model.errors import truth_value
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -99,14 +99,16 @@ def jog_session(
         known = (start or ready.home) if is_simulated(ready) else None
         start = known or measured_pose(ready, around)
         require_confirmed(confirm, jog_proposal(ready, around, start))
-        session = _Session(
+        _run(
             ready,
-            _PlatformJogs(ready, around, start, on_cycle),
-            realtime,
-            need_real_time_rights,
-            listener,
+            commands,
+            partial(_platform_jogs, ready, around, start),
+            "jog-session",
+            realtime=realtime,
+            need_real_time_rights=need_real_time_rights,
+            listener=listener,
+            on_cycle=on_cycle,
         )
-        supervised(ready, commands, partial(session.run, commands))
 
 
 def cable_session(
@@ -152,179 +154,153 @@ def cable_session(
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
         require_confirmed(confirm, cables_proposal(slow, limit))
-        session = _Session(
+        _run(
             slow,
-            _CableJogs(slow, limit, on_cycle),
-            realtime,
-            need_real_time_rights,
-            listener,
+            commands,
+            partial(_cable_jogs, slow, limit),
+            "jog-cables",
+            cables=slow.cable_count,
+            realtime=realtime,
+            need_real_time_rights=need_real_time_rights,
+            listener=listener,
+            on_cycle=on_cycle,
         )
-        supervised(slow, commands, partial(session.run, commands))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Parts:
+class _Jogs:
     """Parts of one kind of session.
 
     Attributes:
         task: For the real-time process.
-        make_drives: See `winch_mover`.
+        make_drives: See `move_supervised`.
         status: Reported status.
+        progress: Of the jogs: the checked line, or the cable travel.
         take_cycle: Called after every cycle.
-        on_cycle: Called after that.
     """
 
     task: MotionTask
     make_drives: Callable[..., AbstractContextManager[ReadyDrives]]
     status: SessionStatus
+    progress: JogProver | CableTravel
     take_cycle: Callable[[CycleRecord], None]
-    on_cycle: Callable[[CycleRecord], None]
 
 
-class _Kind(Protocol):
-    """Kind of session."""
-
-    @property
-    def folder(self) -> str:
-        """Name of its record folder in ``runs``."""
-        ...
-
-    @property
-    def cables(self) -> int:
-        """See `PressBoard`."""
-        ...
-
-    def parts(
-        self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
-    ) -> _Parts:
-        """Makes the parts; resources to close go to the stack."""
-        ...
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _PlatformJogs:
-    """Moves the platform along a checked straight line."""
-
-    folder: ClassVar[str] = "jog-session"
-    cables: ClassVar[int] = 0
-
-    rig: Rig
-    scene: Scene
-    start: Pose
-    on_cycle: Callable[[CycleRecord, PressBoard, JogProver], None] | None
-
-    def parts(
-        self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
-    ) -> _Parts:
-        """See `_Kind`."""
-        rig, load = self.rig, self.scene.load
-        memory = SharedMemory.create(PieceRing.size(rig.cable_count))
-        stack.callback(memory.close)
-        send = PieceRing(memory, rig.cable_count).put
-        prover = JogProver(rig, self.scene, self.start, presses, send)
-        task = JogMotion(
-            rig=rig.document,
-            cables=rig.cable_count,
-            cycle=rig.cycle,
-            begin=tuple(map(int, WinchMap(rig).counts_at(self.start, load))),
-            presses=presses.memory,
-            pieces=memory,
-            reference=MotionInterlock(rig).require_ready(),
-        )
-        on_cycle = self.on_cycle or _nothing
-        return _Parts(
-            task,
-            partial(drives_of, rig.document, self.start, load),
-            JogStatus(rig, board, prover, simulated_time=not realtime),
-            prover.take_cycle,
-            lambda record: on_cycle(record, presses, prover),
-        )
+def _platform_jogs(
+    rig: Rig,
+    scene: Scene,
+    start: Pose,
+    board: RequestBoard,
+    presses: PressBoard,
+    stack: ExitStack,
+    *,
+    simulated_time: bool,
+) -> _Jogs:
+    """Moves the platform along a checked straight line; its memory is closed by the stack."""
+    load = scene.load
+    memory = SharedMemory.create(PieceRing.size(rig.cable_count))
+    stack.callback(memory.close)
+    send = PieceRing(memory, rig.cable_count).put
+    prover = JogProver(rig, scene, start, presses, send)
+    task = JogMotion(
+        rig=rig.document,
+        cables=rig.cable_count,
+        cycle=rig.cycle,
+        begin=tuple(map(int, WinchMap(rig).counts_at(start, load))),
+        presses=presses.memory,
+        pieces=memory,
+        reference=MotionInterlock(rig).require_ready(),
+    )
+    return _Jogs(
+        task,
+        partial(drives_of, rig.document, start, load),
+        JogStatus(rig, board, prover, simulated_time=simulated_time),
+        prover,
+        prover.take_cycle,
+    )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _CableJogs:
+def _cable_jogs(
+    rig: Rig,
+    limit: float,
+    board: RequestBoard,
+    presses: PressBoard,
+    _stack: ExitStack,
+    *,
+    simulated_time: bool,
+) -> _Jogs:
     """Moves one cable at a time."""
-
-    folder: ClassVar[str] = "jog-cables"
-
-    rig: Rig
-    limit: float
-    on_cycle: Callable[[CycleRecord, PressBoard, CableTravel], None] | None
-
-    @property
-    def cables(self) -> int:
-        """See `PressBoard`."""
-        return self.rig.cable_count
-
-    def parts(
-        self, board: RequestBoard, presses: PressBoard, stack: ExitStack, *, realtime: bool
-    ) -> _Parts:
-        """See `_Kind`."""
-        rig, limit, longest = self.rig, self.limit, LONGEST_MM / 1000.0
-        travel = CableTravel(rig, limit, longest)
-        speed = rig.motion.speed
-        task = CableMotion(rig.cable_count, rig.cycle, limit, speed, longest, presses.memory)
-        on_cycle = self.on_cycle or _nothing
-        return _Parts(
-            task,
-            partial(unreferenced_drives_of, rig.document, rig.home, limit, None),
-            CableStatus(rig, board, travel, simulated_time=not realtime),
-            lambda record: travel.take_cycle(record, presses.held()),
-            lambda record: on_cycle(record, presses, travel),
-        )
+    longest = LONGEST_MM / 1000.0
+    travel = CableTravel(rig, limit, longest)
+    speed = rig.motion.speed
+    return _Jogs(
+        CableMotion(rig.cable_count, rig.cycle, limit, speed, longest, presses.memory),
+        partial(unreferenced_drives_of, rig.document, rig.home, limit, None),
+        CableStatus(rig, board, travel, simulated_time=simulated_time),
+        travel,
+        lambda record: travel.take_cycle(record, presses.held()),
+    )
 
 
-def _nothing(_record: CycleRecord, _presses: PressBoard, _moved: object) -> None:
-    """Default for `on_cycle`."""
+def _run(
+    rig: Rig,
+    commands: Commands,
+    make_jogs: Callable[..., _Jogs],
+    name: str,
+    *,
+    cables: int = 0,
+    realtime: bool,
+    need_real_time_rights: bool,
+    listener: Listener,
+    on_cycle: Callable[[CycleRecord, PressBoard, Any], None] | None,
+) -> None:
+    """Runs a session; the command socket takes the presses; errors as `supervised`.
 
+    Args:
+        rig: The robot and its bus.
+        commands: Those taken since the start of the verb.
+        make_jogs: `_platform_jogs` or `_cable_jogs`, with the arguments before the board.
+        name: Of its record folder in ``runs``.
+        cables: See `PressBoard`.
+        realtime: As for `jog_session`, like all that follow.
+        need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
+        listener: Receives events.
+        on_cycle: Called after every cycle.
+    """
+    clock = SimulatedClock(rig.cycle)
+    now = time.monotonic if realtime else lambda: clock.now
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Session:
-    """One session and its options."""
-
-    rig: Rig
-    kind: _Kind
-    realtime: bool
-    need_real_time_rights: bool
-    listener: Listener
-
-    def run(self, commands: Commands) -> WinchResult:
-        """Runs the session; the command socket takes the presses."""
-        rig, clock, board = self.rig, SimulatedClock(self.rig.cycle), commands.board
-        now = time.monotonic if self.realtime else lambda: clock.now
+    def session() -> WinchResult:
         with ExitStack() as stack:
-            presses = PressBoard(now, self.kind.cables)
+            presses = PressBoard(now, cables)
             stack.callback(presses.close)
-            parts = self.kind.parts(board, presses, stack, realtime=self.realtime)
+            jogs = make_jogs(commands.board, presses, stack, simulated_time=not realtime)
 
             began = math.inf  # with the first cycle: the drives' set-up may take minutes
 
             def take_cycle(record: CycleRecord) -> None:
                 nonlocal began
                 began = min(began, record.at)
-                parts.take_cycle(record)
+                jogs.take_cycle(record)
                 if record.at - max(began, presses.last_heard) > IDLE:
                     presses.end()
-                parts.on_cycle(record)
+                if on_cycle is not None:
+                    on_cycle(record, presses, jogs.progress)
 
-            mover = winch_mover(
-                rig,
-                parts.task,
-                parts.make_drives,
-                board,
-                clock=clock,
-                need_real_time_rights=self.need_real_time_rights,
-                listener=self.listener,
-            )
             return move_supervised(
                 rig,
                 commands,
-                mover,
-                parts.status,
-                self.kind.folder,
-                listener=self.listener,
+                jogs.task,
+                jogs.make_drives,
+                jogs.status,
+                name,
+                clock=clock,
+                need_real_time_rights=need_real_time_rights,
+                listener=listener,
                 showing=nullcontext(take_cycle),
                 presses=presses,
                 # Its user must know when drives are enabled.
                 unreported={"moving", "traceback", REMARK},
             )
+
+    supervised(rig, commands, session)

@@ -24,7 +24,7 @@ from executor.realtime.shared_memory import (
     pack_event,
 )
 from executor.state_machine import SIMULATED, CycleRecord, LoopEvent, State
-from executor.supervision import OperatorRequests
+from executor.supervision import SupervisorCalls
 from model.errors import CdprError, Fault
 from model.pose import Pose
 from model.rig import Rig
@@ -109,15 +109,7 @@ class MotionTask(ABC):
     cycle: float
 
     @abstractmethod
-    def loop(
-        self,
-        drives: ReadyDrives,
-        master: SyncMaster,
-        *,
-        requests: Callable[[], OperatorRequests],
-        on_cycle: Callable[[CycleRecord], None],
-        on_event: Callable[[LoopEvent], None],
-    ) -> Procedure:
+    def loop(self, drives: ReadyDrives, master: SyncMaster, calls: SupervisorCalls) -> Procedure:
         """The procedure; arguments as for `executor.control.loop.Loop`.
 
         Raises:
@@ -306,9 +298,8 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
         )
         try:
             with before_motion():
-                loop = motion.loop(
-                    drives, master, requests=supervised.read, on_cycle=on_cycle, on_event=on_event
-                )
+                calls = SupervisorCalls(supervised.read, on_cycle, on_event)
+                loop = motion.loop(drives, master, calls)
                 loop.arm(partial(motion.require, drives))
             assert master.status is not None
             released = without_torque(drives.rig, master.status.status_words.tolist())

@@ -23,7 +23,6 @@ from drivers.can_bus import receive_frame
 from drivers.odrive.endpoints import read_endpoints
 from drivers.odrive.messages import (
     BROADCAST,
-    OWN_DBC,
     AxisError,
     AxisState,
     ControlMode,
@@ -283,7 +282,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         if not isinstance(document, OdriveDocument):
             raise TypeError("the rig has no ODrives")
         self._document = document
-        self._layouts = read_layouts(Path(document.dbc) if document.dbc else OWN_DBC)
+        self._layouts = read_layouts(document.dbc)
         self._since_update = 0.0
         # Drives that report more often than once a cycle do so at different positions.
         self._steps = max(1, math.ceil(rig.document.bus.cycle_ms / document.estimates_ms))

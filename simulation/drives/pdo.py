@@ -236,11 +236,6 @@ class Deadlines:
         """Removes a deadline."""
         self._due.pop(what, None)
 
-    def clear(self) -> None:
-        """Removes all deadlines."""
-        self._due.clear()
-        self.earliest = inf
-
     def kept(self) -> list[Hashable]:
         """All events with a deadline."""
         return list(self._due)

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from executor import winch_runs
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, JogProver, Piece, PieceRing
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
@@ -328,14 +329,14 @@ def test_the_set_up_of_the_drives_is_no_time_without_a_held_control(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Many drives with slow SDO answers take minutes: the session ended with its first cycle."""
-    make_mover = sessions.winch_mover
+    make_mover = winch_runs.WinchesHere
 
-    def after_a_minute(*parts: Any, clock: SimulatedClock, **options: Any) -> Any:
+    def after_a_minute(task: Any, drives: Any, clock: SimulatedClock, board: Any) -> Any:
         for _ in range(round(60.0 / rig().cycle)):
             clock.next_cycle()
-        return make_mover(*parts, clock=clock, **options)
+        return make_mover(task, drives, clock, board)
 
-    monkeypatch.setattr(sessions, "winch_mover", after_a_minute)
+    monkeypatch.setattr(winch_runs, "WinchesHere", after_a_minute)
     monkeypatch.setattr(sessions, "IDLE", 5.0)
     records = Script([], 99.0).run(scene())
     assert 60.0 < records[0].at < 62.0

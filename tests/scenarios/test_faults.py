@@ -70,11 +70,11 @@ def slip(stage: Stage) -> None:
 
 def tear(stage: Stage) -> None:
     """The cable's motor has no load any more."""
-    stage.rehearsal._drive_train.per_newton[5] = 0.0
+    stage.rehearsal.per_newton[5] = 0.0
 
 
 def overload(stage: Stage) -> None:
-    stage.rehearsal._drive_train.per_newton[5] *= 6.0
+    stage.rehearsal.per_newton[5] *= 6.0
 
 
 def late(stage: Stage) -> None:

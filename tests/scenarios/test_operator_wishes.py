@@ -147,7 +147,7 @@ def test_a_resume_does_not_undo_a_stop(prepared: PreparedRun, tmp_path: Path) ->
 
 def test_a_fault_while_holding_is_latched(prepared: PreparedRun, tmp_path: Path) -> None:
     def tear(stage: Stage) -> None:
-        stage.rehearsal._drive_train.per_newton[5] = 0.0
+        stage.rehearsal.per_newton[5] = 0.0
 
     stage, outcome = run(prepared, tmp_path, c150=HOLD, c250=tear, c400=RESUME)
     assert outcome.state is State.LATCHED

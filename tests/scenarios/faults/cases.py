@@ -217,7 +217,7 @@ def feels(share: float) -> Callable[[Bench], object]:
     """The motor of cable 6 feels another load."""
 
     def happens(bench: Bench) -> None:
-        bench.rehearsal._drive_train.per_newton[5] *= share
+        bench.rehearsal.per_newton[5] *= share
 
     return happens
 
