@@ -128,6 +128,7 @@ def run(
         Refused: The plan does not pass the checks, the bus is latched, or the drives cannot be
             armed; nothing moved.
         HardwareMissing: A drive or a camera does not answer; nothing moved.
+        Fault: A process of the program failed before anything moved.
         StoppedByOperator: Cancelled before anything moved.
         KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
     """

@@ -262,7 +262,6 @@ SENTENCES = {
     "dict_type": "must hold keys and values",
     "model_attributes_type": "must hold keys and values",
     "union_tag_invalid": "its {discriminator} {tag!r} is not one of {expected_tags}",
-    "union_tag_not_found": "must have the key {discriminator}",
     "literal_error": "must be {expected}",
     "recursion_loop": "refers to itself",
 }
@@ -294,7 +293,7 @@ def problems_of(
     found = []
     for item in error.errors(include_url=False):
         if item["type"] != "invalid_key":  # reported with its position by the YAML reader
-            parts, _ = _followed(item["loc"], model)
+            parts = _followed(item["loc"], model)[0]
             found.append(
                 Problem(key_path(parts), sentence_of(item, model), *position_of(parts, positions))
             )
@@ -315,6 +314,9 @@ def sentence_of(item: Mapping[str, Any], model: type[BaseModel]) -> str:
             return f"needs {_entries(limits['min_length'])} or more, it has {len(value or ())}"
         case "too_long":
             return f"takes {_entries(limits['max_length'])} at most, it has {len(value or ())}"
+        case "union_tag_not_found":
+            kinds = ", ".join(map(repr, _followed(item["loc"], model)[2]))
+            return f"must have the key {limits['discriminator']}, which is one of {kinds}"
     if kind in SENTENCES:
         text = SENTENCES[kind].format(**limits)
     else:
@@ -355,12 +357,14 @@ def _unknown_key(parts: KeyPath, model: type[BaseModel]) -> str:
 
 def _known_keys(model: type[BaseModel], parts: KeyPath) -> list[str]:
     """The keys that a model has at a path; follows nested models and lists of models."""
-    _, current = _followed(parts, model)
+    current = _followed(parts, model)[1]
     return list(current.model_fields) if current is not None else []
 
 
-def _followed(parts: KeyPath, model: type[BaseModel]) -> tuple[KeyPath, type[BaseModel] | None]:
-    """A key path as in the file, and the model at that path.
+def _followed(
+    parts: KeyPath, model: type[BaseModel]
+) -> tuple[KeyPath, type[BaseModel] | None, dict[str, type[BaseModel]]]:
+    """A key path as in the file, the model at that path, and the choices if it is one of several.
 
     Where a key holds one of several models, pydantic adds the name of the chosen one after the key;
     the file has no such part.
@@ -378,7 +382,7 @@ def _followed(parts: KeyPath, model: type[BaseModel]) -> tuple[KeyPath, type[Bas
         field = current.model_fields.get(part)
         choices = _choices(field) if field is not None else {}
         current = model_in(field.annotation) if field is not None else None
-    return tuple(kept), current
+    return tuple(kept), current, choices
 
 
 def _choices(field: FieldInfo) -> dict[str, type[BaseModel]]:

@@ -16,13 +16,20 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from executor.control.winch_laws import CableStep
-from executor.jogging import SPEED
+import cdpr
+from cdpr.cli.app import VERBS
+from drivers.can_load import bus_load
+from executor.control.winch_laws import MOST_RESERVE, RESERVE, RESERVE_COUNTS, CableStep
+from executor.jogging import LONGEST_MM, SPEED
 from executor.winch_runs import limit_of
+from model.errors import BadInput, Fault, HardwareMissing, Refused
+from model.files.new_rig import AFTER_COORDINATES, BEFORE_COORDINATES
 from model.files.plan_file import PlanDocument
-from model.files.rig_file import RigDocument
+from model.files.rig_file import CableDocument, PlatformDocument, RigDocument, WinchDocument
 from model.files.scene_file import SceneDocument
 from model.rig import load_rig, rig_from_document
+from model.statics.gravity import STANDARD_GRAVITY
+from planner.anytime import path as anytime_path
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = re.compile(r"^\s*(https?:)?//", re.IGNORECASE)
@@ -169,6 +176,72 @@ def test_a_jog_of_one_cable_takes_as_long_as_commissioning_says() -> None:
                 law.next(1.0, [float(pull)] + [0.0] * (rig.cable_count - 1))
                 cycles += 1
             assert cycles * rig.cycle == pytest.approx(float(said), rel=0.03)
+
+
+def fall(ms: int) -> str:
+    """How far a body falls from rest."""
+    return f"{500.0 * STANDARD_GRAVITY * (ms / 1000.0) ** 2:.1f} mm in {ms} ms"
+
+
+def percent(share: float) -> str:
+    return f"{100.0 * share:.0f} %"
+
+
+def eight_drives(cycle_ms: int) -> str:
+    return percent(bus_load(8, cycle_ms / 1000.0, 1_000_000))
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        ("odrive.md", f"from rest by {fall(15)}, {fall(30)} and {fall(50)}"),
+        (
+            "console.md",
+            f"{percent(RESERVE)} of the range from half of `min_tension_n` to the limit, but at"
+            f" least the tension of {RESERVE_COUNTS:g} counts and at most {percent(MOST_RESERVE)}",
+        ),
+        (
+            "planner.md",
+            f"A round makes {anytime_path._TRIALS} small random changes to one of them"
+            f" ({anytime_path._SLOW_TRIALS} for a rig with pulleys",
+        ),
+        (
+            "rig-file.md",
+            f"need {eight_drives(10)} of 1 Mbit/s at 10 ms and {eight_drives(4)} at 4 ms",
+        ),
+        (
+            "rig-file.md",
+            f"without the section `{RigDocument.model_fields['drives'].default.type}`",
+        ),
+        (
+            "safety.md",
+            f"exit code {BadInput.exit_code}, {Refused.exit_code} or {HardwareMissing.exit_code},"
+            f" or with {Fault.exit_code} if a process of the program itself fails",
+        ),
+        ("your-own-rig.md", f"at most {LONGEST_MM:g} mm at a time"),
+    ],
+)
+def test_a_page_repeats_what_the_program_does(page: str, words: str) -> None:
+    assert words in " ".join((ROOT / "docs" / page).read_text("utf-8").split())
+
+
+def test_the_page_on_python_lists_the_verbs_that_have_a_function() -> None:
+    page = (ROOT / "docs" / "from-python.md").read_text("utf-8")
+    functions, _, rest = page.split("```")[0].partition("; others")
+    with_a_function = {verb.name for verb in VERBS} & set(cdpr.__all__)
+    assert set(re.findall(r"`(\w+)`", functions)) == with_a_function
+    assert not set(re.findall(r"`(?:cdpr )?(\w+)`", rest)) & with_a_function
+
+
+def test_the_page_on_a_new_rig_lists_what_no_question_asks_for() -> None:
+    page = (ROOT / "docs" / "your-own-rig.md").read_text("utf-8")
+    listed = page.split("It does not ask for")[1].partition(" of each winch")[0]
+    asked = {question.key for question in (*BEFORE_COORDINATES, *AFTER_COORDINATES)}
+    asked |= {"size_mm", "home", "drum_mm_per_rev"}  # by other names
+    measured_later = {"home_counts", "cable_stiffness_n"}
+    parts: tuple[type[BaseModel], ...] = (PlatformDocument, CableDocument, WinchDocument)
+    of_a_rig = {"pulleys"}.union(*(part.model_fields for part in parts))
+    assert set(re.findall(r"`(\w+)`", listed)) == of_a_rig - asked - measured_later
 
 
 def test_commissioning_writes_no_file_twice() -> None:
