@@ -23,10 +23,12 @@ from executor.cameras.sources import require_camera_source
 from model.cameras import generic_camera
 from model.errors import BadInput, path_of
 from model.files.documents import write_bytes_atomic
+from model.files.output import make_folder
 from model.files.reading import files_in, is_folder
 from model.pose import Array
 from model.progress import SILENT, Listener
 from model.rig import Camera
+from planner.settings import whole_number
 from tracking.camera_model import Image
 
 STILL_PX = 0.7
@@ -222,8 +224,8 @@ class ImageSet:
             advance(number)
 
 
-ImageSource = ImageSet | str | int | Path | Callable[[], ImageSet]
-"""Images, a function that opens them, or a folder, video, camera index or camera address."""
+ImageSource = ImageSet | str | int | Path
+"""Images, or a folder, video, camera index or camera address."""
 DEFAULT_IMAGES, DEFAULT_TAG_IMAGES = 20, 40
 """Default number of images for camera extrinsics, and for the tag layout."""
 VIDEO_IMAGES = 80
@@ -242,13 +244,11 @@ def open_images(folder: Path) -> ImageSet:
     return ImageSet(images, len(images.names), images.unused)
 
 
-def open_source(
-    source: str | int | Path, camera: Camera, wanted: int | None, usual: int
-) -> ImageSet:
+def open_source(source: ImageSource, camera: Camera, wanted: int | None, usual: int) -> ImageSet:
     """The images of a source.
 
     Args:
-        source: A folder, a video file, a camera's index or its address.
+        source: A folder, a video file, a camera's index or its address, or the images themselves.
         camera: The rig's camera that took them.
         wanted: Number of images to take from a camera, or to sample evenly from a video.
         usual: Default for ``wanted``.
@@ -258,12 +258,14 @@ def open_source(
             a folder.
         HardwareMissing: The camera does not open.
     """
+    if isinstance(source, ImageSet):
+        return source
     path = path_of(str(source) if isinstance(source, int) else source)
-    most = wanted or usual
+    most = usual if wanted is None else whole_number("pictures", wanted, least=1)
     if is_folder(path):
         if wanted is not None:
             raise BadInput(
-                "--pictures is for a video or a camera",
+                "`pictures=` is for a video or a camera",
                 where=str(source),
                 next_step="leave it out: all images of a folder are used",
             )
@@ -273,15 +275,6 @@ def open_source(
         return _sampled(VideoFile(path, camera), most)
     require_camera_source(str(source))
     return ImageSet(_live(str(source), camera, most), most, is_live=True)
-
-
-def open_image_source(pictures: ImageSource, camera: Camera, usual: int) -> ImageSet:
-    """The images of a source; ``usual`` many from a camera or a video."""
-    if isinstance(pictures, ImageSet):
-        return pictures
-    if callable(pictures):
-        return pictures()
-    return open_source(pictures, camera, None, usual)
 
 
 def open_timed_images(source: Path, camera: Camera, rate: float | None) -> ImageSet:
@@ -369,6 +362,7 @@ def capture_images(
     *,
     wanted: int = 40,
     size: tuple[int, int] = (1280, 720),
+    replace: bool = False,
     on_advice: Callable[[str], None] = SILENT.note,
     stopped: Callable[[], bool] = lambda: False,
 ) -> int:
@@ -376,11 +370,12 @@ def capture_images(
 
     Args:
         source: A camera's index, device or address, or a video file.
-        folder: Existing folder for the images, ``live_001.png`` …; the first one replaces all
-            images of an earlier session.
+        folder: For the images, ``live_001.png`` …; created if missing.
         board: The target to detect.
         wanted: Minimum number of images.
         size: Width and height of the camera's images, [px]; a video has its own.
+        replace: Whether the folder may have images of an earlier session; the first one replaces
+            them all.
         on_advice: Receives the next instruction for the operator whenever it changes.
         stopped: Ends the capture when true; called after each image, and while there is none.
 
@@ -390,8 +385,11 @@ def capture_images(
     Raises:
         HardwareMissing: The camera does not open.
         BadInput: The source is unknown, its images are of another size, none was captured, or the
-            folder has images from elsewhere.
+            folder has images from elsewhere, or any without `replace`.
     """
+    if not Path(source).is_file():
+        require_camera_source(source)
+    make_folder(folder, replace)
     guide, last = CaptureGuide(board, wanted), ""
     earlier = _captured(folder)
     with _frames(source, size, stopped) as frames:

@@ -45,8 +45,8 @@ from calibration.pictures import (
     DEFAULT_TAG_IMAGES,
     ImageSet,
     ImageSource,
-    open_image_source,
     open_images,
+    open_source,
     open_timed_images,
 )
 from calibration.results import (
@@ -184,6 +184,7 @@ def locate_camera(
     camera: str | None = None,
     poses: Mapping[str, Pose] | str | Path | None = None,
     survey: Survey | None = None,
+    pictures: int | None = None,
     wanted: float = 1e-3,
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
@@ -199,6 +200,7 @@ def locate_camera(
         poses: Platform poses by image, a CSV file of them, or a run folder, to use the rig's
             motion; the frame tags are used when left out.
         survey: How well the frame tags were surveyed; each corner to 0.5 mm when left out.
+        pictures: Number of images from a video or a camera; 20 when left out.
         wanted: Required error in the work space, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives the progress.
@@ -217,12 +219,12 @@ def locate_camera(
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
-    pictures, to = open_image_source(source, taken_by, DEFAULT_IMAGES), Destination.of(output)
+    opened, to = open_source(source, taken_by, pictures, DEFAULT_IMAGES), Destination.of(output)
     to.require_free("extrinsics", taken_by.name)
     ready_to_measure(listener)
-    with pictures.reported("detecting tags", listener) as images:
+    with opened.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in tags]
-        observations = observe_tags(images, rig, taken_by, numbers, pictures.unused)
+        observations = observe_tags(images, rig, taken_by, numbers, opened.unused)
     if known is None:
         found = locate_by_frame_tags(rig, taken_by, observations, survey or Survey(0.5e-3, None))
     else:
@@ -240,6 +242,7 @@ def locate_tags(
     *,
     camera: str | None = None,
     fixed_tag: int | None = None,
+    pictures: int | None = None,
     wanted: float = 0.2e-3,
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
@@ -253,6 +256,7 @@ def locate_tags(
         camera: Which of the rig's cameras took them; the first when left out. Its matrix and
             distortion are taken as known.
         fixed_tag: Tag kept as in the rig file; when left out, the best fit of all tags is.
+        pictures: Number of images from a video or a camera; 40 when left out.
         wanted: Required error of tag corners, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives the progress.
@@ -265,12 +269,12 @@ def locate_tags(
     taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
-    pictures, to = open_image_source(source, taken_by, DEFAULT_TAG_IMAGES), Destination.of(output)
+    opened, to = open_source(source, taken_by, pictures, DEFAULT_TAG_IMAGES), Destination.of(output)
     to.require_free("tags", rig.name)
     ready_to_measure(listener)
-    with pictures.reported("detecting tags", listener) as images:
+    with opened.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
-        observations = observe_tags(images, rig, taken_by, numbers, pictures.unused)
+        observations = observe_tags(images, rig, taken_by, numbers, opened.unused)
     found = measure_layout(rig, taken_by, observations, fixed_tag)
     verdict = judge_layout(found, wanted)
     result = tags_result(found, verdict, rig.document, to.on)

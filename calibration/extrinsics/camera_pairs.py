@@ -31,7 +31,7 @@ from calibration.pictures import (
     DEFAULT_IMAGES,
     ImageSet,
     ImageSource,
-    open_image_source,
+    open_source,
     same_images,
 )
 from calibration.procedures import ExtrinsicsOutcome
@@ -346,6 +346,7 @@ def locate_camera_by_another(
     sources: tuple[ImageSource, ImageSource],
     *,
     board: Board | None = None,
+    pictures: int | None = None,
     wanted: float = 1e-3,
     output: Destination | str | Path | None = None,
     listener: Listener = SILENT,
@@ -359,6 +360,7 @@ def locate_camera_by_another(
         sources: Images of this and of the other camera; simultaneous ones have the same name, in
             videos the same number.
         board: The board that both see; the tags of the platform when left out.
+        pictures: Number of images from each video; 20 when left out.
         wanted: Required error in the work space, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
         listener: Receives the progress.
@@ -384,12 +386,12 @@ def locate_camera_by_another(
     unused: dict[str, str] = {}
     both = (camera, reference)
     opened = [
-        open_image_source(source, one, DEFAULT_IMAGES)
+        open_source(source, one, pictures, DEFAULT_IMAGES)
         for one, source in zip(both, sources, strict=True)
     ]
     _require_recorded(both, opened)
-    for one, pictures in zip(both, same_images(opened), strict=True):
-        found_by_one, left_out = _observations(rig, one, pictures, board, listener)
+    for one, images in zip(both, same_images(opened), strict=True):
+        found_by_one, left_out = _observations(rig, one, images, board, listener)
         seen.append(found_by_one)
         unused |= {f"{one.name}: {name}": why for name, why in left_out.items()}
     own, others = seen

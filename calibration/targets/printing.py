@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 
 from calibration.targets.boards import Board, Charuco, Chessboard
 from calibration.targets.grids import CircleGrid, TagGrid
-from model.errors import BadInput
+from model.errors import BadInput, path_of
+from model.files.documents import write_bytes_atomic
+from model.files.output import require_new_file
 from model.pose import Array
 from model.rig import Rig
 from tracking.detection.tags import modules_across, official_modules
@@ -328,6 +331,26 @@ class Printout:
     def pdf(self) -> bytes:
         """The sheets as a PDF file, in exact size."""
         return pdf_of(list(self.pages), f"cdpr: {self.what}")
+
+    def save(self, path: Path | str, *, replace: bool = False) -> None:
+        """Writes the sheets to a PDF file.
+
+        Args:
+            path: Its name ends in ``.pdf``.
+            replace: Whether it may exist.
+
+        Raises:
+            BadInput: It exists, is named otherwise, or cannot be written.
+        """
+        path = path_of(path)
+        require_new_file(path, replace)
+        if path.suffix.lower() != ".pdf":
+            raise BadInput(
+                "the output must be a PDF file",
+                where=str(path),
+                next_step=f"name it {path.with_suffix('.pdf').name}",
+            )
+        write_bytes_atomic(path, self.pdf())
 
 
 def printout(of: Board | Rig, paper: str = "a4") -> Printout:

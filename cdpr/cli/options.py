@@ -61,8 +61,6 @@ CALIBRATION = option(
 def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
     """The rig with values replaced by calibration results, in memory only.
 
-    A result that is not good enough is used too, with its verdict as a remark.
-
     Raises:
         BadInput: A file cannot be used, or belongs to another rig.
     """
@@ -70,10 +68,15 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
         return rig
     results = [calibration.load_result(file) for file in files]
     better = rig.with_calibration(*results, listener=Terminal())
+    remark_on_verdicts(results)
+    return better
+
+
+def remark_on_verdicts(results: Sequence[calibration.ResultDocument]) -> None:
+    """Remarks on each result that is used although it is not good enough."""
     for one in results:
         if not one.good_enough:
             Terminal().remark(f"calibration {one.kind} {one.name}, {one.date}: {one.verdict}")
-    return better
 
 
 # Verbs that reach drives: the rig, its bus, and the motion.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from itertools import chain
 from typing import IO, Any, cast
 
@@ -106,16 +106,6 @@ def progress_bar(text: str, total: float | None, shown: bool) -> Iterator[Advanc
         yield advance
 
 
-@contextmanager
-def spinner(text: str, shown: bool) -> Iterator[None]:
-    """Shows on a terminal that something takes a moment."""
-    if not shown or not err.is_terminal:
-        yield
-        return
-    with err.status(text):
-        yield
-
-
 class Terminal(Listener):
     """Shows the reports of a library function on stderr."""
 
@@ -148,7 +138,10 @@ class Terminal(Listener):
     @contextmanager
     def waiting(self, text: str) -> Iterator[None]:
         """See `Listener`."""
-        with self._exclusive() as shown, spinner(text, shown):
+        with (
+            self._exclusive() as shown,
+            err.status(text) if shown and err.is_terminal else nullcontext(),
+        ):
             yield
 
     @contextmanager

@@ -44,7 +44,7 @@ from planner.settings import (
     settings_from_options,
 )
 
-_PANEL = "Open readings of the paper's text (docs/paper.md)"
+_READING: dict[str, Any] = {"rich_help_panel": "Open readings of the paper's text (docs/paper.md)"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,18 +72,14 @@ class SearchOptions:
     max_iterations: int | None = option(
         "the paper's planners: largest number of samples", min=1, max=1_000_000
     )
-    failure_rate: FailureRate | None = option("e_r, k: failures in a row", rich_help_panel=_PANEL)
-    focus: Focus | None = option("the node x_c", rich_help_panel=_PANEL)
-    cone_draw: ConeDraw | None = option(
-        "r and θ₁ uniform, or points uniform in volume", rich_help_panel=_PANEL
-    )
-    steer: Steer | None = option(
-        "steps of --mode paper: as Eq. 9, or as RRT*", rich_help_panel=_PANEL
-    )
+    failure_rate: FailureRate | None = option("e_r, k: failures in a row", **_READING)
+    focus: Focus | None = option("the node x_c", **_READING)
+    cone_draw: ConeDraw | None = option("r and θ₁ uniform, or points uniform in volume", **_READING)
+    steer: Steer | None = option("steps of --mode paper: as Eq. 9, or as RRT*", **_READING)
     spacing_mm: float | None = option(
-        "reject nodes closer than this to another", min=0.0, rich_help_panel=_PANEL
+        "reject nodes closer than this to another", min=0.0, **_READING
     )
-    goal_sight: bool = flag("every new node tries the goal", rich_help_panel=_PANEL)
+    goal_sight: bool = flag("every new node tries the goal", **_READING)
 
     def with_seed(self, seed: int) -> PlanningOptions:
         """As options of the planner's library."""

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
 import cdpr
 from calibration.geometry.pose_selection import MeasurementPlan
 from drivers import ImageFolder
+from drivers.cameras.files import ImageOutput
 from executor.track import TrackResult
 from model.plan import plan_facts
+from model.progress import Advance, Listener
 from tests.executor import fake_run
 from tracking.track import MultiCameraCount
 from tracking.tracker import Tracker
@@ -91,6 +96,30 @@ def test_a_source_of_images_is_opened_by_what_it_is(rig: cdpr.Rig) -> None:
     assert next(iter(images)).name == "place_01.jpg"
     with pytest.raises(cdpr.BadInput):
         cdpr.open_camera(rig, str(SESSION / "no-such-folder"))
+
+
+@pytest.mark.parametrize("locate", [cdpr.locate_camera, cdpr.locate_tags])
+def test_the_number_of_images_is_that_of_a_video_or_a_camera(
+    rig: cdpr.Rig, tmp_path: Path, locate: Callable[..., object]
+) -> None:
+    totals: list[float | None] = []
+
+    class Totals(Listener):
+        def progress(self, text: str, total: float | None) -> AbstractContextManager[Advance]:
+            totals.append(total)
+            return super().progress(text, total)
+
+    video = tmp_path / "session.avi"
+    with ImageOutput(video, 30.0) as out:
+        for frame in islice(cdpr.open_camera(rig, SESSION / "pictures"), 4):
+            out.write(cv2.cvtColor(frame.image, cv2.COLOR_GRAY2BGR), frame.name)
+    with pytest.raises(cdpr.BadInput, match="`pictures=` is for a video or a camera"):
+        locate(rig, SESSION / "pictures", pictures=2)
+    with pytest.raises(cdpr.BadInput, match="pictures must be a whole number from 1"):
+        locate(rig, video, pictures=0)
+    with suppress(cdpr.BadInput):  # too few tags for the layout
+        locate(rig, video, pictures=2, listener=Totals())
+    assert totals == [2]
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from calibration.targets.printing import (
     PAPERS,
     board_print,
     pdf_of,
+    printout,
     sheet_of,
     sheets_of,
     tag_print,
@@ -164,3 +165,15 @@ def test_a_foreign_renderer_draws_what_we_meant(tmp_path: Path) -> None:
     on_paper, points = seen.corners / 150.0 * 25.4, seen.points[:, :2] * 1e3
     gap = np.linalg.norm(on_paper[0] - on_paper[-1]) / np.linalg.norm(points[0] - points[-1])
     assert gap == pytest.approx(1.0, abs=1e-3)
+
+
+def test_a_script_saves_a_print_and_replaces_none_by_accident(tmp_path: Path) -> None:
+    made, path = printout(BOARDS[0], "a3"), tmp_path / "board.pdf"
+    made.save(str(path))
+    assert path.read_bytes() == made.pdf()
+    with pytest.raises(BadInput, match="exists already"):
+        made.save(path)
+    made.save(path, replace=True)
+    with pytest.raises(BadInput, match="must be a PDF file"):
+        made.save(tmp_path / "board.txt")
+    assert list(tmp_path.iterdir()) == [path]

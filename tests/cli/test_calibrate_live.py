@@ -11,6 +11,7 @@ import pytest
 
 from calibration.pictures import capture_images
 from calibration.targets.boards import Chessboard
+from model.errors import AlreadyExists
 from model.pose import Pose, matrix_from_rotation_vector
 from tests.calibration.board_pictures import SIZE, picture_of
 from tests.cli.program import call, nothing_written, one_message
@@ -138,6 +139,13 @@ def test_images_of_another_source_are_not_mixed_with_new_ones(video: Path, earli
     one_message(answer, 2, "mine.PNG", "choose another folder")
 
 
+def test_a_script_does_not_capture_into_a_folder_of_images_by_accident(
+    video: Path, earlier: Path
+) -> None:
+    with nothing_written(earlier), pytest.raises(AlreadyExists, match="not empty"):
+        capture_images(str(video), earlier, Chessboard(9, 6, 0.025))
+
+
 def test_an_interrupted_session_is_not_mixed_with_an_earlier_one(
     video: Path, earlier: Path
 ) -> None:
@@ -147,6 +155,7 @@ def test_an_interrupted_session_is_not_mixed_with_an_earlier_one(
         str(video),
         earlier,
         Chessboard(9, 6, 0.025),
+        replace=True,
         on_advice=texts.append,
         stopped=lambda: sum(text.startswith("5 of") for text in texts) > 0,
     )

@@ -13,8 +13,6 @@ from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
 from cdpr.cli.output import present
 from model.errors import BadInput
-from model.files.documents import write_bytes_atomic
-from model.files.output import require_new_file
 from model.rig import load_rig
 
 BoardName = Literal["chessboard", "charuco", "circles", "tags"]
@@ -113,13 +111,6 @@ def print_(
           --marker-mm 26 --paper a3
       cdpr calibrate print tags.pdf --rig configs/gachon_8_6.yaml
     """
-    require_new_file(output, force)
-    if output.suffix.lower() != ".pdf":
-        raise BadInput(
-            "the output must be a PDF file",
-            where=str(output),
-            next_step=f"name it {output.with_suffix('.pdf').name}",
-        )
     if rig is not None and printed != BoardOptions():
         raise BadInput(
             "--rig prints the rig's tags in the sizes of the rig file",
@@ -132,8 +123,8 @@ def print_(
             next_step="pass them, or --rig RIG for the tags of a rig",
         )
     made = printout(printed.made() if rig is None else load_rig(rig), paper)
+    made.save(output, replace=force)
     pages, what = made.pages, made.what
-    write_bytes_atomic(output, made.pdf())
     step = "print at 100 %, measure the ruler and the squares, glue it to a flat, stiff plate"
     width, height = pages[0].width_mm, pages[0].height_mm
     document = {

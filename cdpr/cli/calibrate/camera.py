@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import radians
 from pathlib import Path
+from typing import Any
 
 from calibration.extrinsics.camera_pairs import locate_camera_by_another
 from calibration.extrinsics.surveyed_tags import Survey
 from calibration.intrinsics.lens import LensChoice
-from calibration.pictures import (
-    DEFAULT_IMAGES,
-    DEFAULT_TAG_IMAGES,
-    ImageSet,
-    capture_images,
-    open_source,
-)
+from calibration.pictures import capture_images
 from calibration.procedures import (
     calibrate_camera,
     calibrate_camera_from_corners,
@@ -24,18 +18,16 @@ from calibration.procedures import (
     measure_readout,
 )
 from calibration.results import require_file_name
-from calibration.targets.boards import Board
 from cdpr.cli.arguments import argument, option
 from cdpr.cli.calibrate.boards import BoardOptions
 from cdpr.cli.calibrate.results import CAMERA, PICTURES, SOURCE, ResultOptions, wanted_option
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, RIG, calibrated_rig
 from cdpr.cli.output import err, show_line
-from executor.cameras.sources import parse_named_source, require_camera_source
+from executor.cameras.sources import parse_named_source
 from executor.supervision import LocalRequests
 from model.errors import BadInput
-from model.files.output import make_folder
-from model.rig import Camera, load_rig
+from model.rig import load_rig
 
 
 def camera(
@@ -71,6 +63,13 @@ def camera(
       cdpr calibrate camera pictures/ --live 0 --columns 9 --rows 6 --square-mm 25 -o results
     """
     require_file_name(name, "--name")
+    calibrated: dict[str, Any] = {
+        "name": name,
+        "wanted": wanted_mm / 1e3,
+        "distance": distance_m,
+        "lens": lens,
+        "output": result.to,
+    }
     if live is None and folder.suffix.lower() == ".csv":
         if size_px is None:
             raise BadInput(
@@ -78,16 +77,7 @@ def camera(
                 where=str(folder),
                 next_step="pass the width and height of the images that show the corners",
             )
-        made = calibrate_camera_from_corners(
-            folder,
-            size_px,
-            name=name,
-            wanted=wanted_mm / 1e3,
-            distance=distance_m,
-            lens=lens,
-            output=result.to,
-        )
-        result.show(made)
+        result.show(calibrate_camera_from_corners(folder, size_px, **calibrated))
         return
     board = printed.made()
     if live is None and (pictures is not None or size_px is not None):
@@ -98,40 +88,21 @@ def camera(
         )
     if live is not None:
         result.to.require_free("camera", name)
-        if not Path(live).is_file():
-            require_camera_source(live)
-        make_folder(folder, result.force)
-        _take_pictures(live, folder, board, pictures or 40, size_px or (1280, 720))
-    made = calibrate_camera(
-        folder,
-        board,
-        name=name,
-        wanted=wanted_mm / 1e3,
-        distance=distance_m,
-        lens=lens,
-        output=result.to,
-        listener=result.listener,
-    )
-    result.show(made)
-
-
-def _take_pictures(
-    source: str, folder: Path, board: Board, wanted: int, size: tuple[int, int]
-) -> None:
-    """Captures images until there are enough, the video ends, or Ctrl-C."""
-    requests = LocalRequests()
-    with stop_requests(requests):
-        capture_images(
-            source,
-            folder,
-            board,
-            wanted=wanted,
-            size=size,
-            on_advice=lambda text: show_line(text, err),
-            stopped=lambda: requests.read().stop,
-        )
-    if requests.read().stop:
-        err.print("capture stopped; the images so far are used")
+        requests = LocalRequests()
+        with stop_requests(requests):
+            capture_images(
+                live,
+                folder,
+                board,
+                wanted=pictures or 40,
+                size=size_px or (1280, 720),
+                replace=result.force,
+                on_advice=lambda text: show_line(text, err),
+                stopped=lambda: requests.read().stop,
+            )
+        if requests.read().stop:
+            err.print("capture stopped; the images so far are used")
+    result.show(calibrate_camera(folder, board, listener=result.listener, **calibrated))
 
 
 # `cdpr calibrate readout`: readout time of a rolling shutter, top row to bottom row.
@@ -226,8 +197,9 @@ def extrinsics(
             the_rig,
             the_camera,
             another,
-            (_opener(source, the_camera, pictures), _opener(other, another, pictures)),
+            (source, other),
             board=printed.made() if printed != BoardOptions() else None,
+            pictures=pictures,
             wanted=wanted_mm / 1e3,
             output=result.to,
             listener=result.listener,
@@ -242,21 +214,16 @@ def extrinsics(
         )
     made = locate_camera(
         the_rig,
-        _opener(source, the_camera, pictures),
-        camera=the_camera.name,
+        source,
+        camera=camera,
         poses=poses,
         survey=Survey(survey_mm / 1e3, None if survey_deg is None else radians(survey_deg)),
+        pictures=pictures,
         wanted=wanted_mm / 1e3,
         output=result.to,
         listener=result.listener,
     )
     result.show(made)
-
-
-def _opener(
-    source: str, camera: Camera, pictures: int | None, usual: int = DEFAULT_IMAGES
-) -> Callable[[], ImageSet]:
-    return lambda: open_source(source, camera, pictures, usual)
 
 
 # `cdpr calibrate tags`: poses of the tags on the platform.
@@ -284,13 +251,12 @@ def tags(
       cdpr calibrate tags rig.yaml pictures/ -o results
       cdpr calibrate tags rig.yaml pictures/ --calibration calibration_camera_front_2026-03-01.yaml
     """
-    the_rig = calibrated_rig(load_rig(rig), calibration)
-    the_camera = the_rig.camera(camera)
     made = locate_tags(
-        the_rig,
-        _opener(source, the_camera, pictures, DEFAULT_TAG_IMAGES),
-        camera=the_camera.name,
+        calibrated_rig(load_rig(rig), calibration),
+        source,
+        camera=camera,
         fixed_tag=fixed_tag,
+        pictures=pictures,
         wanted=wanted_mm / 1e3,
         output=result.to,
         listener=result.listener,

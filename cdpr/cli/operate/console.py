@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +12,7 @@ import typer
 from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.run import supervise
+from cdpr.cli.operate.supervision import handling
 from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
 from cdpr.cli.output import Terminal, out, show_facts, show_line
 from cdpr.console.session import Console
@@ -114,24 +113,11 @@ def serve(files: ConsoleFiles, plan: Path | None, host: str, port: int) -> None:
         show_line("Ctrl-C ends the console and jogging; a run that moves continues")
 
     try:
-        with _closed_terminal_ends():
+        # A closed terminal ends the server as SIGTERM does, and with it a session of jogs.
+        with handling(lambda *_: os.kill(os.getpid(), signal.SIGTERM), (signal.SIGHUP,)):
             run_server(shown, host, port, show_address)
     except KeyboardInterrupt:  # the way to end it
         show_line("console ended")
-
-
-@contextmanager
-def _closed_terminal_ends() -> Iterator[None]:
-    """A closed terminal ends the server as SIGTERM does, and with it a session of jogs."""
-    before = signal.getsignal(signal.SIGHUP)
-    if before is signal.SIG_IGN:  # started with nohup: outlives its terminal
-        yield
-        return
-    signal.signal(signal.SIGHUP, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 # `cdpr demo`: all steps from plan to report on the paper's rig, simulated.

@@ -7,23 +7,19 @@ from pathlib import Path
 from shlex import quote
 
 from cdpr.cli.arguments import flag, given_options, option
-from cdpr.cli.operate.supervision import SignalSupervisor, confirmation
+from cdpr.cli.operate.run import MotionOptions
 from cdpr.cli.options import (
     CALIBRATION,
     CHANNEL,
-    FAST,
     INTERFACE,
     RIG,
-    WITHOUT_REAL_TIME,
-    YES,
     Triple,
     level_pose,
     require_unused,
     rig_on_bus,
 )
-from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
+from cdpr.cli.output import out, show_facts, show_json, show_line
 from executor import homing
-from executor.drives import is_simulated, require_own_time
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,9 +66,7 @@ def home(
     winding: WindingOptions,
     interface: str | None = INTERFACE,
     channel: str | None = CHANNEL,
-    fast: bool = FAST,
-    yes: bool = YES,
-    without_real_time: bool = WITHOUT_REAL_TIME,
+    motion: MotionOptions,
     as_json: bool = flag("print the reference as JSON", "--json"),
 ) -> None:
     """Pretension all cables, then set the encoder reference at a known pose.
@@ -86,17 +80,12 @@ def home(
       cdpr home configs/gachon_8_6.yaml --camera synthetic --fast
     """
     the_rig = rig_on_bus(rig, interface, channel, calibration)
-    confirm = confirmation(asks=not (is_simulated(the_rig) or yes), as_json=as_json)
-    require_own_time(the_rig, not fast)
     if as_rig_file:
         if at_home or pose_mm or camera:
             homing.require_one_pose(False, None, [])
-        require_unused(
-            "cdpr home",
-            given_options(winding) | {"--fast": fast, "--without-real-time": without_real_time},
-            "--as-rig-file neither moves nor measures",
-        )
-        homing.use_rig_file_counts(the_rig, confirm=confirm)
+        unused = given_options(winding) | given_options(motion) | {"--yes": None}
+        require_unused("cdpr home", unused, "--as-rig-file neither moves nor measures")
+        homing.use_rig_file_counts(the_rig, confirm=motion.confirmation(the_rig, as_json))
         if as_json:
             show_json({"file": None})
         else:
@@ -113,11 +102,7 @@ def home(
         speed=winding.speed_mm_s / 1000.0,
         pictures=winding.pictures,
         simulated_slack=winding.simulated_slack_mm / 1000.0,
-        realtime=not fast,
-        need_real_time_rights=not without_real_time,
-        listener=Terminal(quiet=as_json),
-        confirm=confirm,
-        supervisor=SignalSupervisor(),
+        **motion.arguments(the_rig, as_json),
     )
     if as_json:
         file = None if result.file is None else str(result.file)

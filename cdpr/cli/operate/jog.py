@@ -18,28 +18,24 @@ from rich.live import Live
 from rich.text import Text
 
 from cdpr.cli.arguments import flag, given_options, option
-from cdpr.cli.operate.run import supervise
-from cdpr.cli.operate.supervision import Keys, SignalSupervisor, confirmation, speed_by_key
+from cdpr.cli.operate.run import MotionOptions, supervise
+from cdpr.cli.operate.supervision import Keys, speed_by_key
 from cdpr.cli.options import (
-    FAST,
     RIG,
     SUMMARY_JSON,
-    WITHOUT_REAL_TIME,
-    YES,
     BusOptions,
     Quaternion,
     Triple,
     require_unused,
     rotation_of,
 )
-from cdpr.cli.output import Terminal, err, out, show_json, show_line
+from cdpr.cli.output import err, out, show_json, show_line
 from executor import jogging
-from executor.drives import is_simulated, require_own_time
+from executor.drives import is_simulated
 from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import cable_session, jog_session
 from executor.jogging import FASTEST, SPEED
-from executor.proposals import Proposal
 from executor.state_machine import CycleRecord, State
 from model.errors import BadInput
 from model.files.documents import millimetres
@@ -116,20 +112,6 @@ class HeldOptions:
         return Pose(position, rig.home.rotation if rotation is None else rotation)
 
 
-@dataclass(frozen=True, slots=True)
-class DriveOptions:
-    """Settings of drives and output; every field is an option of `cdpr jog`."""
-
-    fast: bool = FAST
-    yes: bool = YES
-    without_real_time: bool = WITHOUT_REAL_TIME
-    as_json: bool = SUMMARY_JSON
-
-    def confirm(self, rig: Rig) -> Callable[[Proposal], bool]:
-        """See `confirmation`; simulated drives move without a question."""
-        return confirmation(asks=not (is_simulated(rig) or self.yes), as_json=self.as_json)
-
-
 #: Keys that hold a jog, and its direction.
 DIRECTIONS = {
     "right": (1.0, 0.0, 0.0),
@@ -162,7 +144,8 @@ def jog(
         "largest speed, at most the rig's", default=1000.0 * SPEED, min=0.1, max=1000.0 * FASTEST
     ),
     bus: BusOptions,
-    drives: DriveOptions,
+    motion: MotionOptions,
+    as_json: bool = SUMMARY_JSON,
 ) -> None:
     """Move the platform slowly and straight by a few millimetres from its current pose.
 
@@ -178,13 +161,12 @@ def jog(
       cdpr jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene configs/environment_1.yaml --fast
     """
     the_rig = bus.rig(rig)
-    require_own_time(the_rig, not drives.fast)
-    speed = min(speed_mm_s / 1000.0, the_rig.motion.speed)
+    speed = speed_mm_s / 1000.0
     path = given_options(distance) | given_options(surroundings) | {"--output": output}
     if cable is not None or mm is not None:
         why = "a single cable is moved without a path, and obstacles are not checked"
         require_unused("cdpr jog", path, why)
-        _one_cable(the_rig, cable, mm, limit_n, speed, drives)
+        _one_cable(the_rig, cable, mm, limit_n, speed, motion, as_json)
         return
     if not held.hold_to_run:
         require_unused("cdpr jog", {"--end-with": held.end_with}, "only with --hold-to-run")
@@ -194,7 +176,7 @@ def jog(
             "--simulated-start-wxyz": held.simulated_start_wxyz,
         }
         require_unused("cdpr jog", simulated_start, "only with --hold-to-run or --keys")
-    no_effect = {"--json": drives.as_json, "--fast": drives.fast}
+    no_effect = {"--json": as_json, "--fast": motion.fast}
     if held.one_cable:
         if not held.hold_to_run or held.keys:
             raise BadInput(
@@ -206,14 +188,14 @@ def jog(
         why = "controls move one cable at a time, without a path"
         require_unused("cdpr jog", path | no_effect, why)
         session = partial(cable_session, the_rig, limit=limit_n, speed=speed)
-        _hold_to_run(session, the_rig, drives, parent=held.end_with)
+        _hold_to_run(session, the_rig, motion, parent=held.end_with)
         return
     why = "only with --cable or --one-cable; a path uses the rig's limits"
     require_unused("cdpr jog", {"--limit-n": limit_n}, why)
     if held.hold_to_run or held.keys:
         unused = given_options(distance) | {"--output": output} | no_effect
         require_unused("cdpr jog", unused, "held controls set the direction, in real time")
-        keys = JogKeys(Keys(), 1000.0 * speed) if held.keys else None
+        keys = JogKeys(Keys(), 1000.0 * min(speed, the_rig.motion.speed)) if held.keys else None
         session = partial(
             jog_session,
             the_rig,
@@ -221,11 +203,11 @@ def jog(
             speed=speed,
             start=held.start(the_rig),
         )
-        _hold_to_run(session, the_rig, drives, keys, held.end_with)
+        _hold_to_run(session, the_rig, motion, keys, held.end_with)
         return
     by = None if distance.by_mm is None else millimetres(list(distance.by_mm))
     jogging.require_distance(by, to_home=distance.to_home)
-    motion = partial(
+    jog_by = partial(
         jogging.jog,
         the_rig,
         surroundings.loaded(),
@@ -233,21 +215,22 @@ def jog(
         to_home=distance.to_home,
         speed=speed,
         folder=output,
-        realtime=not drives.fast,
-        need_real_time_rights=not drives.without_real_time,
+        realtime=not motion.fast,
+        need_real_time_rights=not motion.without_real_time,
     )
-    raise typer.Exit(supervise(motion, the_rig, yes=drives.yes, as_json=drives.as_json))
+    raise typer.Exit(supervise(jog_by, the_rig, yes=motion.yes, as_json=as_json))
 
 
 def _hold_to_run(
     session: Callable[..., object],
     rig: Rig,
-    drives: DriveOptions,
+    motion: MotionOptions,
     keys: JogKeys | None = None,
     parent: int | None = None,
 ) -> None:
     """Runs a session of hold-to-run controls until it ends, or the process that started it."""
-    ask = drives.confirm(rig)
+    arguments = motion.arguments(rig, as_json=False)
+    ask = arguments["confirm"]
 
     def is_orphan() -> bool:
         return parent is not None and os.getppid() != parent
@@ -259,13 +242,8 @@ def _hold_to_run(
             keys.take_cycle(record, presses, progress)
 
     with keys or ExitStack():
-        session(
-            need_real_time_rights=not drives.without_real_time,
-            listener=Terminal(),
-            confirm=lambda proposal: not is_orphan() and ask(proposal),
-            supervisor=SignalSupervisor(),
-            on_cycle=take_cycle,
-        )
+        arguments["confirm"] = lambda proposal: not is_orphan() and ask(proposal)
+        session(**arguments, on_cycle=take_cycle)
     out.print("jogging ended" + ("" if is_simulated(rig) else "; the drives hold"))
 
 
@@ -365,7 +343,8 @@ def _one_cable(
     mm: float | None,
     limit_n: float | None,
     speed: float,
-    drives: DriveOptions,
+    motion: MotionOptions,
+    as_json: bool,
 ) -> None:
     if cable is None or mm is None:
         raise BadInput(
@@ -379,15 +358,11 @@ def _one_cable(
         mm / 1000.0,
         limit=limit_n,
         speed=speed,
-        realtime=not drives.fast,
-        need_real_time_rights=not drives.without_real_time,
-        listener=Terminal(quiet=drives.as_json),
-        confirm=drives.confirm(rig),
-        supervisor=SignalSupervisor(),
+        **motion.arguments(rig, as_json),
     )
     moved_mm = done.moved * 1000.0
     tensions = [round(float(t), 2) for t in done.tensions]
-    if drives.as_json:
+    if as_json:
         show_json({"cable": cable, "moved_mm": round(moved_mm, 4), "tensions_n": tensions})
         return
     out.print(f"cable {cable} moved by {moved_mm:+.3f} mm, positive pays out; the drives hold")

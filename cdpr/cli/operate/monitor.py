@@ -7,7 +7,7 @@ import math
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -79,40 +79,28 @@ def monitor(
         write_atomic(foxglove_layout, console.layout_text() + "\n")
         return
     if once:
-        status = _first(process, rate) if wait else request_run("status", process, verb="monitor")
+        status: dict[str, Any] | None
+        if wait:
+            status = next(follow_run(process, rate, waits=True), None)
+        else:
+            status = request_run("status", process, verb="monitor")
+        if status is None:  # the run ended at once
+            raise no_run("monitor")
         if as_json:
             show_json(status)
         else:
             typer.echo(status_text(status))
         return
     # Ctrl-C ends the monitor, not the run.
-    with _foxglove(foxglove) as stream, suppress(KeyboardInterrupt):
+    serving: AbstractContextManager[console.FoxgloveStream | None]
+    serving = nullcontext() if foxglove is None else console.foxglove_stream(foxglove)
+    with serving as stream, suppress(KeyboardInterrupt):
+        if stream is not None:
+            show_line(f"Foxglove: open the connection {stream.address}", err)
         if as_json or not out.is_terminal:
             _lines(follow_run(process, rate, waits=wait), as_json, stream)
         else:
             _live(process, rate, stream)
-
-
-def _first(process: int | None, rate: float) -> dict[str, Any]:
-    """The first status of a run, after waiting for one.
-
-    Raises:
-        Fault: It ended without a status.
-    """
-    for status in follow_run(process, rate, waits=True):
-        return status
-    raise no_run("monitor")
-
-
-@contextmanager
-def _foxglove(port: int | None) -> Iterator[console.FoxgloveStream | None]:
-    """A server for Foxglove; none without a port."""
-    if port is None:
-        yield None
-        return
-    with console.foxglove_stream(port) as stream:
-        show_line(f"Foxglove: open the connection {stream.address}", err)
-        yield stream
 
 
 def _lines(

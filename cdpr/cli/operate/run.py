@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import typer
 from rich.markup import escape
 
 from cdpr.cli.arguments import argument, flag, option
-from cdpr.cli.operate.supervision import RunSupervisor, confirmation, print_safely
+from cdpr.cli.operate.supervision import (
+    RunSupervisor,
+    SignalSupervisor,
+    confirmation,
+    print_safely,
+)
 from cdpr.cli.options import (
     CALIBRATION,
     CHANNEL,
@@ -136,6 +143,29 @@ def supervise(
         result = motion(listener=Terminal(quiet=as_json), confirm=confirm, supervisor=supervisor)
         show_files(result, as_json)
     return result.exit_code
+
+
+@dataclass(frozen=True, slots=True)
+class MotionOptions:
+    """Time and confirmation of a motion; every field is an option."""
+
+    fast: bool = FAST
+    yes: bool = YES
+    without_real_time: bool = WITHOUT_REAL_TIME
+
+    def confirmation(self, rig: Rig, as_json: bool) -> Callable[[Proposal], bool]:
+        """See `confirmation`; simulated drives move without a question."""
+        return confirmation(asks=not (is_simulated(rig) or self.yes), as_json=as_json)
+
+    def arguments(self, rig: Rig, as_json: bool) -> dict[str, Any]:
+        """Arguments that the library's functions to wind winches and to jog have in common."""
+        return {
+            "realtime": not self.fast,
+            "need_real_time_rights": not self.without_real_time,
+            "listener": Terminal(quiet=as_json),
+            "confirm": self.confirmation(rig, as_json),
+            "supervisor": SignalSupervisor(),
+        }
 
 
 def show(result: RunResult, as_json: bool) -> None:

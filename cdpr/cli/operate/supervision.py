@@ -10,7 +10,7 @@ import sys
 import termios
 import threading
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -79,9 +79,12 @@ def has_agreed(question: str, otherwise: str) -> bool:
 
 
 @contextmanager
-def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Routes the operator's signals to a function until the end of the block."""
-    before = {number: signal.getsignal(number) for number in STOP_SIGNALS}
+def handling(
+    handler: Callable[[int, FrameType | None], None],
+    signals: Sequence[signal.Signals] = STOP_SIGNALS,
+) -> Iterator[None]:
+    """Routes signals of the operator, SIGHUP among them, to a function until the end of a block."""
+    before = {number: signal.getsignal(number) for number in signals}
     if before[signal.SIGHUP] is signal.SIG_IGN:  # started with nohup: outlives its terminal
         del before[signal.SIGHUP]
     try:
@@ -96,7 +99,7 @@ def _handling(handler: Callable[[int, FrameType | None], None]) -> Iterator[None
 @contextmanager
 def stop_requests(board: RequestBoard) -> Iterator[None]:
     """Turns Ctrl-C, SIGTERM and a closed terminal into a stop request."""
-    with _handling(lambda _number, _frame: board.ask_stop()):
+    with handling(lambda _number, _frame: board.ask_stop()):
         yield
 
 
@@ -157,7 +160,7 @@ class RunSupervisor(SignalSupervisor):
 
     def take_over(self) -> None:
         """Takes over the signals, once the operator agreed to the run."""
-        self._signals.enter_context(_handling(self._on_signal))
+        self._signals.enter_context(handling(self._on_signal))
 
     def conclude(self, work: Callable[[], _T]) -> _T:
         """See `Supervisor`; signals are handled already."""
