@@ -40,7 +40,7 @@ from executor.recording.run_folder import (
     RunFolder,
 )
 from executor.recording.summary import RunContext, summarize
-from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no_poses
+from executor.recording.tables import OK, CycleTable, PoseTable, fused_table
 from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
 from executor.report import build_report
 from executor.state_machine import SIMULATED, State
@@ -129,7 +129,7 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     """
     rig, plan, course = folder.rig(), folder.plan(), folder.course()
     cycles = folder.cycles_cut_short(rig.cable_count)
-    poses = folder.poses() if folder.has(POSES) else no_poses()
+    poses = folder.poses() if folder.has(POSES) else PoseTable.empty()
     events = folder.events()
     if not course.final_state:
         course = _ended_by_events(course, cycles, events)
@@ -357,7 +357,7 @@ def _complete_events(folder: RunFolder, events: Sequence[RunEvent]) -> None:
 
 def _pose_table(samples: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
     if not samples:
-        return no_poses()
+        return PoseTable.empty()
     position, rotation = np.full((len(samples), 3), np.nan), np.full((len(samples), 4), np.nan)
     covariance = np.full((len(samples), 6, 6), np.nan)
     reprojection = np.full(len(samples), np.nan)

@@ -212,6 +212,7 @@ def _cycles(rig: Rig, scene: Scene, every: int) -> CycleTable:
     tensions = np.column_stack([np.interp(np.arange(n), some, solved[:, i]) for i in range(m)])
     noise = np.random.default_rng(2).normal(0.0, 0.1, (n, m))
     return CycleTable(
+        cycle=np.arange(n),
         time=np.arange(n) * CYCLE * every,
         state=("moving",) * (n - 1) + ("finished",),
         path_index=np.arange(n) * every,

@@ -15,7 +15,7 @@ from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.summary import _clearance, summarize
-from executor.recording.tables import CycleTable, no_poses
+from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import distances, encoder_pose, following, replies, tensions
 from executor.report.tiles import chips
 from executor.trajectory.path import rounded
@@ -116,7 +116,7 @@ def test_the_figures_are_those_of_the_tables(run: fake_run.FakeRun) -> None:
 
 
 def test_without_camera_and_obstacles_these_figures_are_null(run: fake_run.FakeRun) -> None:
-    made = replace(run, poses=no_poses(), clearance=no_clearance()).summary
+    made = replace(run, poses=PoseTable.empty(), clearance=no_clearance()).summary
     assert made["passed"]
     assert made["tag_error_mm"] is None
     assert made["clearance_mm"] is None
@@ -201,7 +201,7 @@ def test_a_stopped_run_that_broke_a_limit_is_failed(run: fake_run.FakeRun) -> No
 
 def test_a_run_of_no_cycles_fails_with_a_whole_summary(run: fake_run.FakeRun) -> None:
     none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
-    early = replace(run, cycles=none, poses=no_poses(), clearance=no_clearance())
+    early = replace(run, cycles=none, poses=PoseTable.empty(), clearance=no_clearance())
     made = summary(early, final_state="latched", fast=False)
     assert made["verdict"] == "FAILED"
     assert made["following_error_mm"]["max"] is None
