@@ -98,12 +98,12 @@ class ClearanceTable(Table):
         return self._chosen(self.time >= time)
 
     def _chosen(self, rows: NDArray[np.bool_]) -> ClearanceTable:
-        every: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        chosen = {
-            name: values[rows] if isinstance(values, np.ndarray) else tuple(compress(values, rows))
-            for name, values in every.items()
-        }
-        return ClearanceTable(**chosen | {"obstacles": self.obstacles})
+        chosen: dict[str, Any] = {"obstacles": self.obstacles}
+        for name in {field.name for field in fields(self)} - chosen.keys():
+            values = getattr(self, name)
+            is_array = isinstance(values, np.ndarray)
+            chosen[name] = values[rows] if is_array else tuple(compress(values, rows))
+        return ClearanceTable(**chosen)
 
     def columns(self) -> list[Column]:
         """All columns of the file; those of each obstacle are last, side by side."""
@@ -125,13 +125,14 @@ class ClearanceTable(Table):
         Raises:
             BadInput: A column is missing or has invalid values.
         """
-        first, planned = file.pairs_from(len(cls.layout()))
-        distances, due = (Columns(names, "%.6f", _MM, (len(names),)) for names in (first, planned))
+        facts = cls.attributes_in(file)
+        pairs = file.pairs_from(len(facts))
+        near, planned = (Columns(names, "%.6f", _MM, (len(names),)) for names in pairs)
         return cls(
-            **cls.attributes_in(file),
-            obstacles=tuple(_UNIT.sub("", name) for name in first),
-            distances=distances.read(file),
-            planned_distances=due.read(file),
+            **facts,
+            obstacles=tuple(_UNIT.sub("", name) for name in near.names),
+            distances=near.read(file),
+            planned_distances=planned.read(file),
         )
 
 

@@ -91,7 +91,7 @@ class Columns:
         """
         if self.kind is str:
             return file.texts(self.names[0])
-        found = np.empty((len(file), *self.shape), self.kind)
+        found: Any = np.empty((len(file), *self.shape), self.kind)
         for name, at, by in self._entries():
             column = file.column(name, self.kind)
             found[:, *at] = found[:, *at[::-1]] = column if self.kind is int else column / by

@@ -261,10 +261,9 @@ class RunFolder:
             BadInput: A complete line cannot be read.
         """
         path = self.path / CYCLES
-        lines = whole_lines(path) if path.is_file() else []
-        if not lines:
-            return CycleTable.empty(cable_count)
-        return self._with_cables(CycleTable.of_file(TableFile(path, "\n".join(lines))), cable_count)
+        text = "\n".join(whole_lines(path)) if path.is_file() else ""
+        table = CycleTable.of_file(TableFile(path, text)) if text else CycleTable.empty(cable_count)
+        return self._with_cables(table, cable_count)
 
     def _with_cables(self, table: CycleTable, cables: int) -> CycleTable:
         if table.cable_count != cables:

@@ -169,7 +169,7 @@ def test_texts_of_files_cannot_become_markup(tmp_path: Path, run: fake_run.FakeR
     document = run.context.plan.document
     scene = document.scene.model_dump(mode="json")
     scene["name"] = scene["obstacles"][0]["name"] = evil
-    context = replace(
+    context = fake_run.changed(
         run.context,
         plan=with_scene(run, SceneDocument.model_validate(scene)),
         interface=evil,
@@ -219,7 +219,7 @@ def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(
         run,
         cycles=replace(run.cycles, state=states),
         poses=poses,
-        context=replace(run.context, cameras=used),
+        context=fake_run.changed(run.context, cameras=used),
     )
     folder = fake_run.write(made, tmp_path / "run", pictures=False)
     for camera, table in (("front", poses), ("blind", PoseTable.empty())):
@@ -244,7 +244,7 @@ def test_a_run_that_ended_before_its_first_cycle_still_has_a_page(
     tmp_path: Path, run: fake_run.FakeRun
 ) -> None:
     none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
-    context = replace(run.context, final_state="latched", fast=False)
+    context = fake_run.changed(run.context, final_state="latched", fast=False)
     early = replace(
         run, context=context, cycles=none, poses=PoseTable.empty(), clearance=no_clearance()
     )
@@ -257,7 +257,8 @@ def test_a_run_that_ended_before_its_first_cycle_still_has_a_page(
 def test_a_run_in_real_time_shows_its_lateness(tmp_path: Path, run: fake_run.FakeRun) -> None:
     late = np.abs(np.random.default_rng(5).normal(0.0, 1e-4, len(run.cycles)))
     cycles = replace(run.cycles, lateness=late)
-    context = replace(run.context, fast=False, simulated=False, interface="socketcan")
+    real = {"fast": False, "simulated": False, "interface": "socketcan"}
+    context = fake_run.changed(run.context, **real)
     page = built(replace(run, cycles=cycles, context=context), tmp_path / "run")
     assert "Lateness of the cycles" in page.text
     assert "real drives, bus socketcan" in page.text

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from executor.evaluation import _context_of, _planned
+from executor.evaluation import _planned
 from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
@@ -31,7 +31,7 @@ def run() -> fake_run.FakeRun:
 
 
 def summary(run: fake_run.FakeRun, **context: Any) -> dict[str, Any]:
-    return replace(run, context=replace(run.context, **context)).summary
+    return replace(run, context=fake_run.changed(run.context, **context)).summary
 
 
 def rows(
@@ -395,9 +395,9 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
 def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:
     """They may lose replies like real ones: the bus is real."""
     run = fake_run.make(rate_hz=1.0, every=100, camera=False)
-    course = RunCourse(run.context.started, "udp_multicast", False, False, "finished")
+    course = RunCourse(run.context.course.started, "udp_multicast", False, False, "finished")
     for events, simulated in (((), False), ((RunEvent(0.0, "simulated", ""),), True)):
-        context = _context_of(run.context.plan, run.context.rig, course, run.cycles, events)
+        context = replace(run.context, course=course, events=events)
         cycles = replace(run.cycles, missing=run.cycles.missing + (run.cycles.path_index == 0))
         summary = summarize(context, cycles, run.poses, run.clearance)
         assert summary["simulated"] is simulated

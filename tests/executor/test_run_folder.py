@@ -402,6 +402,13 @@ def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -
     assert (len(again), again.cable_count) == (0, 8)
 
 
+def test_a_record_without_cables_is_refused(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    CycleTable.empty(cables=0).write_csv(folder.path / "cycles.csv")
+    with pytest.raises(BadInput, match=r"cycles\.csv has 0 cables, rig\.json has 8"):
+        folder.cycles()
+
+
 def test_only_the_limit_of_tables_ends_reading_a_record(
     tmp_path: Path, run: fake_run.FakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
