@@ -39,15 +39,20 @@ from executor.recording.run_folder import (
     RunEvent,
     RunFolder,
 )
-from executor.recording.summary import RunContext, summarize
-from executor.recording.tables import OK, CycleTable, PoseTable, fused_table, no_poses
-from executor.recording.verdict import HARMLESS, NOT_ENDED, ORDINARY, judge_without_tables
+from executor.recording.summary import summarize
+from executor.recording.tables import OK, CycleTable, PoseTable, fused_table
+from executor.recording.verdict import (
+    HARMLESS,
+    NOT_ENDED,
+    ORDINARY,
+    RunContext,
+    judge_without_tables,
+)
 from executor.report import build_report
-from executor.state_machine import SIMULATED, State
+from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
 from model.errors import BadInput, CdprError, Fault
-from model.plan import Plan
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene
@@ -115,7 +120,7 @@ def evaluate(
     if len(poses):
         take_file(partial(_written, _pose_files(folder, poses, alone)))
     clearance = _clearance(prepared.rig, prepared.scene, cycles, seen)
-    context = _context_of(prepared.plan.plan, prepared.rig, course, cycles, outcome.log.events)
+    context = RunContext(prepared.plan.plan, prepared.rig, course, tuple(outcome.log.events))
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, alone, clearance, summary)
 
@@ -129,7 +134,7 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     """
     rig, plan, course = folder.rig(), folder.plan(), folder.course()
     cycles = folder.cycles_cut_short(rig.cable_count)
-    poses = folder.poses() if folder.has(POSES) else no_poses()
+    poses = folder.poses() if folder.has(POSES) else PoseTable.empty()
     events = folder.events()
     if not course.final_state:
         course = _ended_by_events(course, cycles, events)
@@ -156,7 +161,7 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     if len(poses) and not course.cameras:
         troubles.append("Whether the cameras failed is not on record")
     course = replace(course, troubles=tuple(troubles))
-    context = _context_of(plan, rig, course, cycles, events)
+    context = RunContext(plan, rig, course, tuple(events))
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, folder.poses_by_camera(), clearance, summary)
 
@@ -177,32 +182,6 @@ def _ended_by_events(
     if stops:
         return replace(course, final_state=State.STOPPED.value, cause=stops[0])
     return replace(course, final_state=State.FINISHED.value)
-
-
-def _context_of(
-    plan: Plan,
-    rig: Rig,
-    course: RunCourse,
-    cycles: CycleTable,
-    events: Sequence[RunEvent],
-) -> RunContext:
-    """Context of a run besides its tables; simulated drives on a bus report themselves."""
-    simulated = course.simulated or any(event.code == SIMULATED for event in events)
-    return RunContext(
-        plan=plan,
-        rig=rig,
-        interface=course.interface,
-        simulated=simulated,
-        fast=course.fast,
-        started=course.started,
-        duration=float(cycles.time[-1]) + rig.cycle if len(cycles) else 0.0,
-        final_state=course.final_state,
-        events=tuple(events),
-        versions=dict(course.versions),
-        cause=course.cause,
-        cameras=course.cameras,
-        troubles=course.troubles,
-    )
 
 
 def not_evaluated(
@@ -357,7 +336,7 @@ def _complete_events(folder: RunFolder, events: Sequence[RunEvent]) -> None:
 
 def _pose_table(samples: Sequence[CameraSample], cycles: CycleTable) -> PoseTable:
     if not samples:
-        return no_poses()
+        return PoseTable.empty()
     position, rotation = np.full((len(samples), 3), np.nan), np.full((len(samples), 4), np.nan)
     covariance = np.full((len(samples), 6, 6), np.nan)
     reprojection = np.full(len(samples), np.nan)

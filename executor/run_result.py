@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from drivers.can_bus import IN_PROCESS
-from executor.recording.csv_columns import TableFile
+from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
+from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import faults_among
 from model.errors import BadInput, path_of
 from model.files.reading import TABLE_LIMIT
@@ -115,20 +116,17 @@ class RunResult:
     @cached_property
     def cycles(self) -> Columns:
         """Every cycle of the loop: the columns of ``cycles.csv``."""
-        return self._table(CYCLES)
+        return CycleTable.read_columns(self.folder / CYCLES)
 
     @cached_property
     def poses(self) -> Columns:
         """Fused camera poses: the columns of ``poses.csv``."""
-        return self._table(POSES)
+        return PoseTable.read_columns(self.folder / POSES)
 
     @cached_property
     def clearance(self) -> Columns:
         """Distances to obstacles: the columns of ``clearance.csv``."""
-        return self._table(CLEARANCE)
-
-    def _table(self, name: str) -> Columns:
-        return TableFile(self.folder / name).columns()
+        return ClearanceTable.read_columns(self.folder / CLEARANCE)
 
     @property
     def smallest_clearance(self) -> float:

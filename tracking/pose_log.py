@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from model.files.csv_table import quoted
 from model.files.documents import write_atomic
 from tracking.clearance import MeasuredClearance
 from tracking.measurement import NoPose, Observation
 
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 _UNITS = ("mm", "mm", "mm", "deg", "deg", "deg")
-_SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
+SCALES = np.array([1e3, 1e3, 1e3, *([float(np.degrees(1.0))] * 3)])
 _PAIRS = tuple(combinations_with_replacement(range(6), 2))
 
 
@@ -25,17 +26,13 @@ def _covariance_name(i: int, j: int) -> str:
 
 
 #: Names of the columns, units in the names. Rotations are about the world's axes.
+POSITION = tuple(f"{axis}_mm" for axis in "xyz")
+ROTATION = tuple(f"q{axis}" for axis in "wxyz")
+STD = tuple(f"std_{axis}_{unit}" for axis, unit in zip(_AXES, _UNITS, strict=True))
+COVARIANCE = tuple(_covariance_name(i, j) for i, j in _PAIRS)
 POSE_COLUMNS = (
-    "frame",
-    "time_s",
-    "status",
-    *(f"{axis}_mm" for axis in "xyz"),
-    *(f"q{axis}" for axis in "wxyz"),
-    *(f"std_{axis}_{unit}" for axis, unit in zip(_AXES, _UNITS, strict=True)),
-    *(_covariance_name(i, j) for i, j in _PAIRS),
-    "tags",
-    "reprojection_px",
-    "picture",
+    *("frame", "time_s", "status", *POSITION, *ROTATION, *STD, *COVARIANCE),
+    *("tags", "reprojection_px", "picture"),
 )
 
 
@@ -73,7 +70,7 @@ def pose_row(logged: LoggedImage) -> tuple[str, ...]:
     if isinstance(found, NoPose):
         nothing = ("",) * (len(POSE_COLUMNS) - 4)
         return (*head, found.reason, *nothing, logged.name)
-    covariance = found.covariance * np.outer(_SCALES, _SCALES)
+    covariance = found.covariance * np.outer(SCALES, SCALES)
     return (
         *head,
         "ok",
@@ -105,7 +102,7 @@ def write_pose_log(
         pose_row(logged) + (_clearance_values(logged.clearance) if with_clearance else ())
         for logged in pictures
     ]
-    lines = [",".join(_quoted(value) for value in row) for row in (head, *rows)]
+    lines = [",".join(quoted(value) for value in row) for row in (head, *rows)]
     write_atomic(path, "\n".join(lines) + "\n")
 
 
@@ -116,9 +113,3 @@ def _clearance_values(clearance: MeasuredClearance | None) -> tuple[str, ...]:
     nearest = min(clearance.nearest, key=lambda n: n.distance)
     values = (clearance.distance, clearance.uncertainty, clearance.at_most)
     return (*(f"{value * 1e3:.6f}" for value in values), nearest.first, nearest.second)
-
-
-def _quoted(text: str) -> str:
-    if not any(sign in text for sign in ',"\r\n'):
-        return text
-    return '"' + text.replace('"', '""').replace("\r", " ").replace("\n", " ") + '"'

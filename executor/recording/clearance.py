@@ -5,12 +5,21 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
+from itertools import compress
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.csv_columns import TableFile, numbers, texts, write_table
+from executor.recording.csv_columns import (
+    Column,
+    Columns,
+    Table,
+    TableFile,
+    Texts,
+    numbers,
+    texts,
+)
 from model.clearance import ClearanceModel, Nearest
 from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Array, Pose
@@ -19,8 +28,6 @@ from model.winches import WinchMap
 from tracking.clearance import MeasuredClearance, clearance_at
 
 _MM = 1e3
-_FACTS = 8
-"""Columns before those of the obstacles, which are read by index."""
 _UNIT = re.compile(r"_mm( \(obstacle \d+\))?\Z")
 """End of the name of an obstacle's column, with its number if the name alone is not unique."""
 
@@ -40,7 +47,7 @@ def camera_of(source: str) -> str:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ClearanceTable:
+class ClearanceTable(Table):
     """Distances at n poses to each of k obstacles; no rows for a scene without obstacles.
 
     Attributes:
@@ -58,15 +65,15 @@ class ClearanceTable:
         planned_distances: Of the planned pose to each obstacle, shape (n, k), [m].
     """
 
-    time: Array
-    source: tuple[str, ...]
-    distance: Array
-    uncertainty: Array
-    at_most: Array
-    body: tuple[str, ...]
-    obstacle: tuple[str, ...]
-    planned_distance: Array
-    obstacles: tuple[str, ...]
+    time: Annotated[Array, numbers("time_s")]
+    source: Annotated[Texts, texts("source")]
+    distance: Annotated[Array, numbers("distance_mm", scale=_MM)]
+    uncertainty: Annotated[Array, numbers("uncertainty_mm", scale=_MM)]
+    at_most: Annotated[Array, numbers("at_most_mm", scale=_MM)]
+    body: Annotated[Texts, texts("body")]
+    obstacle: Annotated[Texts, texts("obstacle")]
+    planned_distance: Annotated[Array, numbers("planned_distance_mm", scale=_MM)]
+    obstacles: Texts
     distances: Array
     planned_distances: Array
 
@@ -76,16 +83,11 @@ class ClearanceTable:
         Raises:
             ValueError: Naming the attribute.
         """
+        Table.__post_init__(self)
         rows, count = len(self.time), len(self.obstacles)
-        for field in fields(self):
-            if field.name != "obstacles" and len(getattr(self, field.name)) != rows:
-                raise ValueError(f"{field.name} does not have {rows} rows, as time has")
         for name in ("distances", "planned_distances"):
             if getattr(self, name).shape != (rows, count):
                 raise ValueError(f"{name} must have shape ({rows}, {count})")
-
-    def __len__(self) -> int:
-        return len(self.time)
 
     def of(self, source: str) -> ClearanceTable:
         """The rows of one source."""
@@ -96,67 +98,41 @@ class ClearanceTable:
         return self._chosen(self.time >= time)
 
     def _chosen(self, rows: NDArray[np.bool_]) -> ClearanceTable:
-        chosen = np.flatnonzero(rows)
-        return ClearanceTable(
-            time=self.time[rows],
-            source=tuple(self.source[i] for i in chosen),
-            distance=self.distance[rows],
-            uncertainty=self.uncertainty[rows],
-            at_most=self.at_most[rows],
-            body=tuple(self.body[i] for i in chosen),
-            obstacle=tuple(self.obstacle[i] for i in chosen),
-            planned_distance=self.planned_distance[rows],
-            obstacles=self.obstacles,
-            distances=self.distances[rows],
-            planned_distances=self.planned_distances[rows],
-        )
+        chosen: dict[str, Any] = {"obstacles": self.obstacles}
+        for name in {field.name for field in fields(self)} - chosen.keys():
+            values = getattr(self, name)
+            is_array = isinstance(values, np.ndarray)
+            chosen[name] = values[rows] if is_array else tuple(compress(values, rows))
+        return ClearanceTable(**chosen)
 
-    def write_csv(self, path: Path) -> None:
-        """Writes ``clearance.csv``.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        columns = [
-            numbers("time_s", self.time),
-            texts("source", self.source),
-            numbers("distance_mm", self.distance, _MM),
-            numbers("uncertainty_mm", self.uncertainty, _MM),
-            numbers("at_most_mm", self.at_most, _MM),
-            texts("body", self.body),
-            texts("obstacle", self.obstacle),
-            numbers("planned_distance_mm", self.planned_distance, _MM),
-        ]
+    def columns(self) -> list[Column]:
+        """All columns of the file; those of each obstacle are last, side by side."""
+        columns = Table.columns(self)
         taken = {column.name for column in columns}
         for i, name in enumerate(self.obstacles):
             pair = f"{name}_mm", f"planned_{name}_mm"
             # An obstacle may be named ``distance``, or ``planned_x`` beside ``x``.
             end = "" if taken.isdisjoint(pair) else f" (obstacle {i + 1})"
             taken |= {*pair}
-            columns.append(numbers(pair[0] + end, self.distances[:, i], _MM))
-            columns.append(numbers(pair[1] + end, self.planned_distances[:, i], _MM))
-        write_table(path, columns)
+            columns += numbers(pair[0] + end, scale=_MM).of(self.distances[:, i])
+            columns += numbers(pair[1] + end, scale=_MM).of(self.planned_distances[:, i])
+        return columns
 
     @classmethod
-    def read_csv(cls, path: Path) -> ClearanceTable:
-        """Reads ``clearance.csv``.
+    def of_file(cls, file: TableFile) -> ClearanceTable:
+        """The table in a file; the columns of obstacles are read by index.
 
         Raises:
-            BadInput: The file is missing, cut short or has other columns.
+            BadInput: A column is missing or has invalid values.
         """
-        table = TableFile(path)
+        facts = cls.attributes_in(file)
+        pairs = file.pairs_from(len(facts))
+        near, planned = (Columns(names, "%.6f", _MM, (len(names),)) for names in pairs)
         return cls(
-            time=table.floats("time_s"),
-            source=table.texts("source"),
-            distance=table.floats("distance_mm", _MM),
-            uncertainty=table.floats("uncertainty_mm", _MM),
-            at_most=table.floats("at_most_mm", _MM),
-            body=table.texts("body"),
-            obstacle=table.texts("obstacle"),
-            planned_distance=table.floats("planned_distance_mm", _MM),
-            obstacles=tuple(_UNIT.sub("", name) for name in table.pairs_from(_FACTS)[0]),
-            distances=table.matrix(table.pairs_from(_FACTS)[0], _MM),
-            planned_distances=table.matrix(table.pairs_from(_FACTS)[1], _MM),
+            **facts,
+            obstacles=tuple(_UNIT.sub("", name) for name in near.names),
+            distances=near.read(file),
+            planned_distances=planned.read(file),
         )
 
 

@@ -12,27 +12,27 @@ from foxglove.messages import CompressedImage, Log, LogLevel, Timestamp
 from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
+from executor.recording.csv_columns import Column
 from executor.recording.mcap_channels import (
+    DRIVES,
     OWN,
     TYPED,
     Message,
-    column_of,
     encoded,
     frame_of,
     nanoseconds,
     pose_message,
     poses_of,
     robot_messages,
-    rows_of,
     scene_messages,
     schema_of,
     stamp_of,
     topic_of,
+    values_of,
 )
 from executor.recording.run_folder import PLAN, RIG, RunFolder
-from executor.recording.summary import RunContext
 from executor.recording.tables import OK, CycleTable, FusedTable, PoseTable
-from executor.recording.verdict import faults_among
+from executor.recording.verdict import RunContext, faults_among
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose
@@ -63,25 +63,22 @@ def camera_messages(
 def _tags(poses: PoseTable, start: int, camera: str = "") -> Iterator[Message]:
     topic = topic_of("/tag_pose", camera)
     yield from poses_of(topic, poses.time, poses.position, poses.rotation, start)
-    covariances = rows_of(poses.covariance.reshape(-1, 36))
-    rows = zip(
-        poses.time.tolist(),
-        poses.frame.tolist(),
-        poses.status,
-        poses.tags,
-        column_of(poses.reprojection),
-        covariances,
-        strict=True,
-    )
-    for time, frame, status, tags, reprojection, covariance in rows:
-        content = {
-            "frame": frame,
-            "status": status,
-            "tags": tags,
-            "reprojection_px": reprojection,
-            "covariance": covariance,
+    contents = _records(
+        {
+            "frame": poses.frame.tolist(),
+            "status": poses.status,
+            "tags": poses.tags,
+            "reprojection_px": values_of(poses.reprojection),
+            "covariance": values_of(poses.covariance.reshape(-1, 36)),
         }
+    )
+    for time, content in zip(poses.time.tolist(), contents, strict=True):
         yield topic_of("/tag_status", camera), time, content
+
+
+def _records(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """A dict for each row of columns."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 def _pictures(
@@ -122,7 +119,7 @@ def write_mcap(
         BadInput: An image cannot be read.
         Fault: The disk is full or gone; no partial file is left.
     """
-    start = int(context.started.timestamp() * 1e6) * 1000
+    start = int(context.course.started.timestamp() * 1e6) * 1000
     messages = [
         *scene_messages(context, start),
         *robot_messages(context.rig, cycles, start),
@@ -198,47 +195,29 @@ def _cycles(cycles: CycleTable, start: int) -> Iterator[Message]:
 
 
 def _drives(cycles: CycleTable) -> Iterator[Message]:
-    drive_keys = ("set_counts", "actual_counts", "length_mm", "planned_tension_n", "tension_n")
-    heads = zip(
-        cycles.state,
-        cycles.path_index.tolist(),
-        cycles.leg.tolist(),
-        cycles.stop,
-        column_of(cycles.travelled * 1e3),
-        column_of(cycles.lateness * 1e3),
-        cycles.missing.tolist(),
-        column_of(cycles.following_error * 1e3),
-        strict=True,
-    )
-    drives = zip(
-        cycles.set_counts.tolist(),
-        cycles.actual_counts.tolist(),
-        rows_of(cycles.lengths * 1e3),
-        rows_of(cycles.planned_tensions),
-        rows_of(cycles.tensions),
-        strict=True,
-    )
-    where, how = ("state", "path_index", "leg", "stop", "path_mm"), ("lateness_ms", "missing")
-    head_keys = (*where, *how, "following_error_mm")
-    every = zip(cycles.time.tolist(), heads, drives, strict=True)
-    for number, (time, head, values) in enumerate(every):
-        content: dict[str, Any] = {"cycle": number, **dict(zip(head_keys, head, strict=True))}
-        content["drives"] = [
-            dict(zip(drive_keys, one, strict=True)) for one in zip(*values, strict=True)
-        ]
-        yield "/drives", time, content
+    columns = {column.name: _json(column) for column in cycles.columns()}
+    *heads, drives = DRIVES["properties"]
+    each = DRIVES["properties"][drives]["items"]["properties"]
+    contents = _records({name: columns[name] for name in heads})
+    cables = [
+        _records({name: columns[f"_{i}_".join(name.rsplit("_", 1))] for name in each})
+        for i in range(1, cycles.cable_count + 1)
+    ]
+    for time, content, *parts in zip(cycles.time.tolist(), contents, *cables, strict=True):
+        yield "/drives", time, {**content, drives: parts}
+
+
+def _json(column: Column) -> Sequence[Any]:
+    """The values of a column for JSON."""
+    return column.values if isinstance(column.values, tuple) else values_of(column.values)
 
 
 def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
-    near, planned = rows_of(clearance.distances * 1e3), rows_of(clearance.planned_distances * 1e3)
+    near = values_of(clearance.distances * 1e3)
+    planned = values_of(clearance.planned_distances * 1e3)
     keys = ("distance_mm", "uncertainty_mm", "at_most_mm", "planned_distance_mm")
-    columns = (
-        clearance.distance,
-        clearance.uncertainty,
-        clearance.at_most,
-        clearance.planned_distance,
-    )
-    values = zip(*(column_of(column * 1e3) for column in columns), strict=True)
+    columns = {column.name: _json(column) for column in clearance.columns()}
+    values = zip(*(columns[key] for key in keys), strict=True)
     for i, row in enumerate(values):
         camera = camera_of(clearance.source[i])
         each = zip(clearance.obstacles, near[i], planned[i], strict=True)

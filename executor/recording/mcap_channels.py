@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from foxglove import messages as fox
 
-from executor.recording.summary import RunContext
+from executor.recording.csv_columns import Integers
 from executor.recording.tables import CycleTable
+from executor.recording.verdict import RunContext
 from model.cameras import Camera
 from model.files.camera_file import FISHEYE
 from model.kinematics import cables_to
@@ -174,17 +175,12 @@ def pose_message(
     return fox.PoseInFrame(timestamp=stamp, frame_id=WORLD, pose=pose)
 
 
-def rows_of(values: Array) -> list[list[float | None]]:
-    """Rows for JSON: null for unknown values."""
-    if np.isfinite(values).all():
-        rows: list[list[float | None]] = values.tolist()
-        return rows
-    return [[v if np.isfinite(v) else None for v in row] for row in values.tolist()]
-
-
-def column_of(values: Array) -> list[float | None]:
-    """A column for JSON: null for unknown values."""
-    return [v if np.isfinite(v) else None for v in values.tolist()]
+def values_of(values: Array | Integers) -> list[Any]:
+    """Values for JSON, in lists as in the array: null for unknown values."""
+    found = values.astype(np.object_)
+    found[~np.isfinite(values)] = None
+    listed: list[Any] = found.tolist()
+    return listed
 
 
 def poses_of(
@@ -222,7 +218,7 @@ def scene_messages(context: RunContext, start: int) -> Iterator[Message]:
     """Obstacles, planned path and the cameras used, once; all cameras if none is on record."""
     stamp = stamp_of(start, 0.0)
     yield "/scene", 0.0, scene_at(context.plan.scene.obstacles, context.plan.waypoints, stamp)
-    used = {record.name for record in context.cameras}
+    used = {record.name for record in context.course.cameras}
     cameras = [one for one in context.rig.cameras if one.name in used] or context.rig.cameras
     for camera in cameras:
         alone = camera.name if len(cameras) > 1 else ""

@@ -1,7 +1,7 @@
 """Small files of a run folder: ``run.json``, schemas for reading, and appended lines.
 
-Unknown keys are ignored: a later version may add some. `executor.recording.summary` describes all
-keys; a damaged or edited run folder causes one message that names the key.
+Unknown keys are ignored: a later version may add some. docs/run-folder.md describes all keys; a
+damaged or edited run folder causes one message that names the key.
 
 ``run.json`` (``schema_version`` 1) has ``started`` (ISO 8601, UTC), ``interface``, ``simulated``,
 ``fast``, ``versions``, ``final_state``, ``cause``, ``cycles``, ``cameras`` (as in
@@ -16,7 +16,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
@@ -221,21 +221,6 @@ class CourseDocument(_Record):
     troubles: list[str] = []
 
 
-def read_course(path: Path) -> CourseDocument:
-    """Reads ``run.json``.
-
-    Raises:
-        BadInput: It cannot be read.
-        InvalidFile: It has invalid keys; all are named.
-    """
-    data = read_json(path, AGAIN)
-    try:
-        return CourseDocument.model_validate(data)
-    except ValidationError as error:
-        problems = problems_of(error, CourseDocument, {})
-        raise InvalidFile(str(path), problems, AGAIN) from None
-
-
 def read_summary(path: Path) -> dict[str, Any]:
     """Reads ``summary.json``, unchanged.
 
@@ -373,19 +358,18 @@ class RunCourse:
             BadInput: It cannot be read.
             InvalidFile: It has invalid keys; all are named.
         """
-        kept = read_course(path)
-        return cls(
-            datetime.fromisoformat(kept.started),
-            kept.interface,
-            kept.simulated,
-            kept.fast,
-            kept.final_state,
-            kept.cause,
-            kept.cycles,
-            tuple(CameraRecord(**one.model_dump(include=_CAMERA_KEYS)) for one in kept.cameras),
-            tuple(kept.troubles),
-            versions=kept.versions,
+        data = read_json(path, AGAIN)
+        try:
+            kept = CourseDocument.model_validate(data)
+        except ValidationError as error:
+            problems = problems_of(error, CourseDocument, {})
+            raise InvalidFile(str(path), problems, AGAIN) from None
+        values = {one.name: getattr(kept, one.name) for one in fields(cls)}
+        values["started"] = datetime.fromisoformat(kept.started)
+        values["cameras"] = tuple(
+            CameraRecord(**one.model_dump(include=_CAMERA_KEYS)) for one in kept.cameras
         )
+        return cls(**values | {"troubles": tuple(kept.troubles)})
 
     def save(self, path: Path) -> None:
         """Writes the file atomically.

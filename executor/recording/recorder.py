@@ -140,6 +140,7 @@ class RunLog:
         )
         fits = off <= most_off  # else a cable is slack, slipped, or was wound in alone
         return CycleTable(
+            cycle=np.arange(first, first + len(cycles)),
             time=cycles["at"] - began,
             state=tuple(_STATES[k].value for k in cycles["state"].tolist()),
             path_index=rows,
@@ -312,10 +313,8 @@ class RecordWriter:
         if first != self._written:  # earlier cycles could not be written: leave no gap
             return
         table = self._log.table(first, end)
-        text = table.csv_rows(first)
-        if first == 0:
-            text = table.csv_header() + text
-        self._folder.append_cycles(text, fsync=self._own_thread)
+        header = table.csv_header() if first == 0 else ""
+        self._folder.append_cycles(header + table.csv_rows(), fsync=self._own_thread)
         self._written, self._written_until = end, at
 
     def _put(self, write: Callable[[], None]) -> None:

@@ -19,6 +19,7 @@ from pydantic import ValidationError
 
 from executor.recording.checksums import REBUILT, require_unchanged
 from executor.recording.clearance import ClearanceTable
+from executor.recording.csv_columns import TableFile
 from executor.recording.record_files import (
     AGAIN,
     RunCourse,
@@ -27,7 +28,7 @@ from executor.recording.record_files import (
     read_summary,
     whole_lines,
 )
-from executor.recording.tables import CycleTable, FusedTable, PoseTable, no_cycles
+from executor.recording.tables import CycleTable, FusedTable, PoseTable
 from model.errors import BadInput, Fault, InvalidFile
 from model.files.documents import problems_of, write_atomic
 from model.files.plan_file import PlanDocument
@@ -260,10 +261,9 @@ class RunFolder:
             BadInput: A complete line cannot be read.
         """
         path = self.path / CYCLES
-        lines = whole_lines(path) if path.is_file() else []
-        if not lines:
-            return no_cycles(cable_count)
-        return self._with_cables(CycleTable.of_lines(path, lines), cable_count)
+        text = "\n".join(whole_lines(path)) if path.is_file() else ""
+        table = CycleTable.of_file(TableFile(path, text)) if text else CycleTable.empty(cable_count)
+        return self._with_cables(table, cable_count)
 
     def _with_cables(self, table: CycleTable, cables: int) -> CycleTable:
         if table.cable_count != cables:

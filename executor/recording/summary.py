@@ -1,20 +1,7 @@
 """``summary.json``: verdict and key figures of a run, computed from its tables.
 
-Keys (``schema_version`` 1): ``verdict`` (PASSED, FAILED, STOPPED), ``passed``, ``sentence``,
-``reasons`` (sentences behind the verdict), ``checks`` [{``name``, ``passed``, ``text``}], ``rig``,
-``scene``, ``plan_hash``, ``rig_hash``, ``interface``, ``simulated``, ``fast``, ``started`` (ISO
-8601, UTC), ``duration_s``, ``cycles``, ``cycle_ms``, ``lost_replies``, ``rejected_frames``,
-``error_frames``, ``path_length_mm``, ``travelled_mm``, ``stops`` [{``name``, ``kind``,
-``reached_s``, ``left_s``}], ``following_error_mm`` {``max``, ``rms``, ``limit``},
-``encoder_error_mm`` {``max``, ``rms``} along the path, ``tag_error_mm`` {``rms``, ``max``,
-``frames``, ``frames_without_pose``} or null without a camera, ``cameras`` [{``name``, ``source``,
-``pictures``, ``poses``, ``dropped``, ``measuring_ms`` (median), ``failed`` (why it gave no images
-any more, or nothing)}], ``clearance_mm`` {``required``, ``planned_min``, ``measured_min``,
-``measured_uncertainty``, ``measured_at_most``, ``pair``, ``at_s``, ``source``} or null without
-obstacles, ``tension_n`` {``min``, ``max``, ``planned_min``, ``planned_max``, ``lower_limit``,
-``upper_limit``}, ``lateness_ms`` {``p50``, ``p99``, ``max``} or null in simulated time,
-``final_state`` (``not_ended`` if the program was killed), ``events`` [{``time_s``, ``code``,
-``text``}], ``versions``. An unknown number is null.
+`executor.recording.record_files.SummaryDocument` names the keys, docs/run-folder.md explains them.
+An unknown number is null.
 
 ``path_length_mm`` of the plan, with its corners, and ``travelled_mm`` of the run are lengths along
 the path: rotation counts as `executor.trajectory.path` says. A plan's own ``length_mm`` is the
@@ -24,8 +11,8 @@ distance travelled by the platform's origin.
 from __future__ import annotations
 
 import platform
-from dataclasses import asdict, dataclass, field
-from datetime import UTC, datetime
+from dataclasses import asdict
+from datetime import UTC
 from importlib.metadata import PackageNotFoundError, version
 from itertools import pairwise
 from typing import Any
@@ -33,53 +20,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.can_bus import IN_PROCESS
 from executor.recording.clearance import MEASURED_WITHIN, ClearanceTable
-from executor.recording.record_files import CameraRecord
-from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
-from executor.recording.verdict import judge
+from executor.recording.verdict import RunContext, judge
 from executor.trajectory.path import line
 from model.plan import Plan
 from model.pose import Array
 from model.rig import Rig
 from model.statics.wrench_sets import rms_anchor_radius
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RunContext:
-    """Context of a run, besides its tables.
-
-    Attributes:
-        plan: Its plan.
-        rig: Its rig.
-        interface: Of the bus, such as ``virtual`` or ``socketcan``.
-        simulated: The drives were simulated, here or by a program at the other end of the bus.
-        fast: Simulated time, so that lateness has no meaning.
-        started: Start time, with time zone.
-        duration: From the beginning of the first cycle to the end of the last, [s].
-        final_state: ``finished``, ``stopped`` or the state of a fault.
-        events: All events, in order.
-        versions: Of programs and libraries, by name.
-        cause: Why the run did not finish; empty for the text of the last event.
-        cameras: Statistics of each camera's images.
-        troubles: Missing data, a sentence each.
-    """
-
-    plan: Plan
-    rig: Rig
-    interface: str
-    simulated: bool
-    fast: bool
-    started: datetime
-    duration: float
-    final_state: str
-    events: tuple[RunEvent, ...]
-    versions: dict[str, str] = field(default_factory=dict)
-    cause: str = ""
-    cameras: tuple[CameraRecord, ...] = ()
-    troubles: tuple[str, ...] = ()
-
 
 LIBRARIES = (
     "cdpr",
@@ -105,24 +53,9 @@ def versions() -> dict[str, str]:
 def summarize(
     context: RunContext, cycles: CycleTable, poses: PoseTable, clearance: ClearanceTable
 ) -> dict[str, Any]:
-    """The content of ``summary.json``; see the module docstring."""
-    last = context.events[-1].text if context.events else ""
-    cause = context.cause or last
-    verdict = judge(
-        context.final_state,
-        cause,
-        context.simulated and context.interface == IN_PROCESS,
-        context.rig,
-        context.plan.scene,
-        cycles,
-        poses,
-        clearance,
-        context.cameras,
-        clearance_stop=any(event.code == "clearance_low" for event in context.events),
-        silent=any(event.code == "drive_silent" for event in context.events),
-        troubles=context.troubles,
-        warnings=[event.text for event in context.events if event.code == "drive_warning"],
-    )
+    """The content of ``summary.json``."""
+    plan, rig, course = context.plan, context.rig, context.course
+    verdict = judge(context, cycles, poses, clearance)
     return {
         "schema_version": 1,
         "verdict": verdict.word,
@@ -130,40 +63,45 @@ def summarize(
         "sentence": verdict.sentence,
         "reasons": verdict.reasons,
         "checks": [asdict(check) for check in verdict.checks],
-        "rig": context.rig.name,
-        "scene": context.plan.scene.name,
-        "plan_hash": context.plan.document.hash,
-        "rig_hash": context.rig.hash,
-        "interface": context.interface,
+        "rig": rig.name,
+        "scene": plan.scene.name,
+        "plan_hash": plan.document.hash,
+        "rig_hash": rig.hash,
+        "interface": course.interface,
         "simulated": context.simulated,
-        "fast": context.fast,
-        "started": context.started.astimezone(UTC).isoformat(timespec="milliseconds"),
-        "duration_s": round(context.duration, 6),
+        "fast": course.fast,
+        "started": course.started.astimezone(UTC).isoformat(timespec="milliseconds"),
+        "duration_s": round(_duration(cycles, rig), 6),
         "cycles": len(cycles),
-        "cycle_ms": context.rig.document.bus.cycle_ms,
+        "cycle_ms": rig.document.bus.cycle_ms,
         "lost_replies": int(cycles.missing.sum()),
         "rejected_frames": int(cycles.rejected.max(initial=0)),
         "error_frames": int(cycles.error_frames.max(initial=0)),
-        "path_length_mm": _path_length(context.plan, context.rig) * 1e3,
+        "path_length_mm": _path_length(plan, rig) * 1e3,
         "travelled_mm": _last(cycles.travelled * 1e3),
         "stops": [
             {"name": stop.name, "kind": stop.kind, **_times_at(cycles, number, stop.name)}
-            for number, stop in enumerate(context.plan.scene.stops, start=1)
+            for number, stop in enumerate(plan.scene.stops, start=1)
         ],
         "following_error_mm": {
             **_size(cycles.following_error * 1e3),
-            "limit": context.rig.motion.following_error * 1e3,
+            "limit": rig.motion.following_error * 1e3,
         },
         "encoder_error_mm": _size(cycles.encoder_error[cycles.time >= cycles.path_began] * 1e3),
         "tag_error_mm": _tag_error(poses, cycles.path_began),
-        "cameras": [asdict(camera) for camera in context.cameras],
-        "clearance_mm": _clearance(clearance, context.plan.scene.obstacle_clearance),
-        "tension_n": _tension(cycles, context.rig),
-        "lateness_ms": None if context.fast else _lateness(cycles.lateness * 1e3),
-        "final_state": context.final_state,
+        "cameras": [asdict(camera) for camera in course.cameras],
+        "clearance_mm": _clearance(clearance, plan.scene.obstacle_clearance),
+        "tension_n": _tension(cycles, rig),
+        "lateness_ms": None if course.fast else _lateness(cycles.lateness * 1e3),
+        "final_state": course.final_state,
         "events": [asdict(event) for event in context.events],
-        "versions": dict(context.versions),
+        "versions": dict(course.versions),
     }
+
+
+def _duration(cycles: CycleTable, rig: Rig) -> float:
+    """From the beginning of the first cycle to the end of the last, [s]."""
+    return float(cycles.time[-1]) + rig.cycle if len(cycles) else 0.0
 
 
 def _path_length(plan: Plan, rig: Rig) -> float:

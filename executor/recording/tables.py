@@ -2,46 +2,49 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
-from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from executor.recording.csv_columns import (
     Column,
+    Columns,
     Integers,
-    TableFile,
-    header,
+    Table,
+    Texts,
     integers,
     numbers,
-    require_equal_lengths,
-    rows,
     texts,
-    write_table,
 )
 from executor.state_machine import ON_PATH
 from model.pose import Array, Pose, quaternion_from_matrix
 from tracking.fusion import Measured, fuse_with_encoders
-from tracking.pose_log import POSE_COLUMNS
+from tracking.pose_log import COVARIANCE, POSITION, ROTATION, SCALES, STD
 
 _MM, _MS = 1e3, 1e3
 _ON_PATH = [state.value for state in ON_PATH]
-_PER_CABLE = (
-    "set_{}_counts",
-    "actual_{}_counts",
-    "length_{}_mm",
-    "planned_tension_{}_n",
-    "tension_{}_n",
-)
+
+
+def _position(prefix: str = "") -> Columns:
+    return numbers(*(prefix + name for name in POSITION), scale=_MM)
+
+
+def _rotation(prefix: str = "") -> Columns:
+    return numbers(*(prefix + name for name in ROTATION), decimals=9)
+
+
+#: Of position and rotation vector about world axes.
+_STD = numbers(*STD, scale=SCALES)
+_COVARIANCE = Columns(COVARIANCE, "%.6e", np.outer(SCALES, SCALES), (6, 6))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CycleTable:
+class CycleTable(Table):
     """The cycles of a run with m cables; n rows. Unknown numbers are NaN.
 
     Attributes:
+        cycle: Its number, from 0, shape (n,).
         time: Since the start of the run, shape (n,), [s].
         state: State of the executor, n texts.
         path_index: Row of the set-point table whose set-points the drives followed when they
@@ -67,33 +70,27 @@ class CycleTable:
         tensions: Tensions from the drives' torques, shape (n, m), [N].
     """
 
-    time: Array
-    state: tuple[str, ...]
-    path_index: Integers
-    leg: Integers
-    stop: tuple[str, ...]
-    travelled: Array
-    lateness: Array
-    missing: Integers
-    rejected: Integers
-    error_frames: Integers
-    planned: Array
-    planned_rotation: Array
-    encoder: Array
-    encoder_rotation: Array
-    following_error: Array
-    set_counts: Integers
-    actual_counts: Integers
-    lengths: Array
-    planned_tensions: Array
-    tensions: Array
-
-    def __post_init__(self) -> None:
-        """See `require_equal_lengths`."""
-        require_equal_lengths(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
+    cycle: Annotated[Integers, integers("cycle")]
+    time: Annotated[Array, numbers("time_s")]
+    state: Annotated[Texts, texts("state")]
+    path_index: Annotated[Integers, integers("path_index")]
+    leg: Annotated[Integers, integers("leg")]
+    stop: Annotated[Texts, texts("stop")]
+    travelled: Annotated[Array, numbers("path_mm", scale=_MM)]
+    lateness: Annotated[Array, numbers("lateness_ms", scale=_MS, decimals=4)]
+    missing: Annotated[Integers, integers("missing")]
+    rejected: Annotated[Integers, integers("rejected_frames")]
+    error_frames: Annotated[Integers, integers("error_frames")]
+    planned: Annotated[Array, _position("planned_")]
+    planned_rotation: Annotated[Array, _rotation("planned_")]
+    encoder: Annotated[Array, _position("encoder_")]
+    encoder_rotation: Annotated[Array, _rotation("encoder_")]
+    following_error: Annotated[Array, numbers("following_error_mm", scale=_MM)]
+    set_counts: Annotated[Integers, integers("set_{}_counts")]
+    actual_counts: Annotated[Integers, integers("actual_{}_counts")]
+    lengths: Annotated[Array, numbers("length_{}_mm", scale=_MM)]
+    planned_tensions: Annotated[Array, numbers("planned_tension_{}_n", decimals=4)]
+    tensions: Annotated[Array, numbers("tension_{}_n", decimals=4)]
 
     @property
     def cable_count(self) -> int:
@@ -124,123 +121,6 @@ class CycleTable:
         error: Array = np.linalg.norm(self.encoder - self.planned, axis=1)
         return error
 
-    def write_csv(self, path: Path) -> None:
-        """Writes ``cycles.csv``.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        write_table(path, self._columns(0))
-
-    def csv_header(self) -> str:
-        """The first line of ``cycles.csv``."""
-        return header(self._columns(0))
-
-    def csv_rows(self, first: int) -> str:
-        """The lines of ``cycles.csv`` for cycles numbered from ``first``."""
-        return rows(self._columns(first))
-
-    def _columns(self, first: int) -> list[Column]:
-        columns = [
-            integers("cycle", np.arange(first, first + len(self))),
-            numbers("time_s", self.time),
-            texts("state", self.state),
-            integers("path_index", self.path_index),
-            integers("leg", self.leg),
-            texts("stop", self.stop),
-            numbers("path_mm", self.travelled, _MM),
-            numbers("lateness_ms", self.lateness, _MS, 4),
-            integers("missing", self.missing),
-            integers("rejected_frames", self.rejected),
-            integers("error_frames", self.error_frames),
-            *_pose(self.planned, self.planned_rotation, "planned_"),
-            *_pose(self.encoder, self.encoder_rotation, "encoder_"),
-            numbers("following_error_mm", self.following_error, _MM),
-        ]
-        for i in range(self.cable_count):
-            columns += self._cable(i)
-        return columns
-
-    def _cable(self, i: int) -> list[Column]:
-        names = [name.format(i + 1) for name in _PER_CABLE]
-        return [
-            integers(names[0], self.set_counts[:, i]),
-            integers(names[1], self.actual_counts[:, i]),
-            numbers(names[2], self.lengths[:, i], _MM),
-            numbers(names[3], self.planned_tensions[:, i], decimals=4),
-            numbers(names[4], self.tensions[:, i], decimals=4),
-        ]
-
-    @classmethod
-    def read_csv(cls, path: Path) -> CycleTable:
-        """Reads ``cycles.csv``.
-
-        Raises:
-            BadInput: The file is missing, cut short or has other columns.
-        """
-        return cls._of(TableFile(path))
-
-    @classmethod
-    def of_lines(cls, path: Path, lines: Sequence[str]) -> CycleTable:
-        """As `read_csv`, from lines of the file, including its header.
-
-        Raises:
-            BadInput: A line has other columns or invalid numbers.
-        """
-        return cls._of(TableFile(path, "\n".join(lines)))
-
-    @classmethod
-    def _of(cls, table: TableFile) -> CycleTable:
-        count = table.count(r"set_\d+_counts")
-        names = [[name.format(i + 1) for i in range(count)] for name in _PER_CABLE]
-        return cls(
-            time=table.floats("time_s"),
-            state=table.texts("state"),
-            path_index=table.ints("path_index"),
-            leg=table.ints("leg"),
-            stop=table.texts("stop"),
-            travelled=table.floats("path_mm", _MM),
-            lateness=table.floats("lateness_ms", _MS),
-            missing=table.ints("missing"),
-            rejected=table.ints("rejected_frames"),
-            error_frames=table.ints("error_frames"),
-            planned=table.matrix([f"planned_{axis}_mm" for axis in "xyz"], _MM),
-            planned_rotation=table.matrix([f"planned_q{axis}" for axis in "wxyz"]),
-            encoder=table.matrix([f"encoder_{axis}_mm" for axis in "xyz"], _MM),
-            encoder_rotation=table.matrix([f"encoder_q{axis}" for axis in "wxyz"]),
-            following_error=table.floats("following_error_mm", _MM),
-            set_counts=table.int_matrix(names[0]),
-            actual_counts=table.int_matrix(names[1]),
-            lengths=table.matrix(names[2], _MM),
-            planned_tensions=table.matrix(names[3]),
-            tensions=table.matrix(names[4]),
-        )
-
-
-def no_cycles(cable_count: int) -> CycleTable:
-    """The table of a run without cycles."""
-    none, whole = np.empty(0), np.empty(0, dtype=np.int64)
-    each, each_whole = np.empty((0, cable_count)), np.empty((0, cable_count), dtype=np.int64)
-    return CycleTable(
-        time=none, state=(), path_index=whole, leg=whole, stop=(), travelled=none, lateness=none,
-        missing=whole, rejected=whole, error_frames=whole,
-        planned=np.empty((0, 3)), planned_rotation=np.empty((0, 4)),
-        encoder=np.empty((0, 3)), encoder_rotation=np.empty((0, 4)), following_error=none,
-        set_counts=each_whole, actual_counts=each_whole, lengths=each, planned_tensions=each,
-        tensions=each,
-    )  # fmt: skip
-
-
-def _pose(positions: Array, rotations: Array, prefix: str = "") -> list[Column]:
-    return [
-        *_side_by_side([f"{prefix}{axis}_mm" for axis in "xyz"], positions * _MM),
-        *_side_by_side([f"{prefix}q{axis}" for axis in "wxyz"], rotations, decimals=9),
-    ]
-
-
-def _side_by_side(names: Sequence[str], values: Array, decimals: int = 6) -> list[Column]:
-    return [numbers(n, values[:, i], decimals=decimals) for i, n in enumerate(names)]
-
 
 def quaternions_of(rotations: Array) -> Array:
     """Rotation matrices, shape (n, 3, 3), as quaternions (w, x, y, z), shape (n, 4)."""
@@ -252,19 +132,11 @@ def quaternions_of(rotations: Array) -> Array:
 # Camera measurements of a run: one row per image.
 
 
-_DEG = float(np.degrees(1.0))
-_SCALES = np.array([_MM, _MM, _MM, _DEG, _DEG, _DEG])
-_PAIRS = tuple(combinations_with_replacement(range(6), 2))
-#: As `cdpr track` names them: ``std_x_mm`` …, ``cov_x_rz_mm_deg`` … in the order of the pairs.
-_STD = tuple(name for name in POSE_COLUMNS if name.startswith("std_"))
-_COVARIANCE = dict(
-    zip(_PAIRS, (name for name in POSE_COLUMNS if name.startswith("cov_")), strict=True)
-)
 OK = "ok"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PoseTable:
+class PoseTable(Table):
     """Measured poses of n images; NaN where an image gave no pose.
 
     Attributes:
@@ -280,23 +152,16 @@ class PoseTable:
         picture: Name of the image kept in the run folder, or empty, n texts.
     """
 
-    frame: Integers
-    time: Array
-    status: tuple[str, ...]
-    position: Array
-    rotation: Array
-    covariance: Array
-    tags: tuple[str, ...]
-    reprojection: Array
-    planned: Array
-    picture: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        """See `require_equal_lengths`."""
-        require_equal_lengths(self)
-
-    def __len__(self) -> int:
-        return len(self.time)
+    frame: Annotated[Integers, integers("frame")]
+    time: Annotated[Array, numbers("time_s")]
+    status: Annotated[Texts, texts("status")]
+    position: Annotated[Array, _position()]
+    rotation: Annotated[Array, _rotation()]
+    covariance: Annotated[Array, _COVARIANCE]
+    tags: Annotated[Texts, texts("tags")]
+    reprojection: Annotated[Array, numbers("reprojection_px", decimals=4)]
+    planned: Annotated[Array, _position("planned_")]
+    picture: Annotated[Texts, texts("picture")]
 
     @property
     def ok(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
@@ -315,80 +180,18 @@ class PoseTable:
         deviations: Array = np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
         return deviations
 
-    def write_csv(self, path: Path) -> None:
-        """Writes ``poses.csv``.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        columns = [
-            integers("frame", self.frame),
-            numbers("time_s", self.time),
-            texts("status", self.status),
-            *_pose(self.position, self.rotation),
-            *_side_by_side(_STD, self.std * _SCALES),
-            *(_covariance(self.covariance, pair) for pair in _PAIRS),
-            texts("tags", self.tags),
-            numbers("reprojection_px", self.reprojection, decimals=4),
-            *_side_by_side([f"planned_{axis}_mm" for axis in "xyz"], self.planned * _MM),
-            texts("picture", self.picture),
-        ]
-        write_table(path, columns)
-
-    @classmethod
-    def read_csv(cls, path: Path) -> PoseTable:
-        """Reads ``poses.csv``.
-
-        Raises:
-            BadInput: The file is missing, cut short or has other columns.
-        """
-        table = TableFile(path)
-        time = table.floats("time_s")
-        covariance = np.empty((len(time), 6, 6))
-        for i, j in _PAIRS:
-            entry = table.floats(_COVARIANCE[i, j], float(_SCALES[i] * _SCALES[j]))
-            covariance[:, i, j] = covariance[:, j, i] = entry
-        return cls(
-            frame=table.ints("frame"),
-            time=time,
-            status=table.texts("status"),
-            position=table.matrix([f"{axis}_mm" for axis in "xyz"], _MM),
-            rotation=table.matrix([f"q{axis}" for axis in "wxyz"]),
-            covariance=covariance,
-            tags=table.texts("tags"),
-            reprojection=table.floats("reprojection_px"),
-            planned=table.matrix([f"planned_{axis}_mm" for axis in "xyz"], _MM),
-            picture=table.texts("picture"),
-        )
-
-
-def _covariance(covariance: Array, pair: tuple[int, int]) -> Column:
-    i, j = pair
-    scale = float(_SCALES[i] * _SCALES[j])
-    return Column(_COVARIANCE[i, j], covariance[:, i, j] * scale, "%.6e")
-
-
-def no_poses() -> PoseTable:
-    """A table without rows, of a run without a camera."""
-    return PoseTable(
-        frame=np.empty(0, dtype=np.int64),
-        time=np.empty(0),
-        status=(),
-        position=np.empty((0, 3)),
-        rotation=np.empty((0, 4)),
-        covariance=np.empty((0, 6, 6)),
-        tags=(),
-        reprojection=np.empty(0),
-        planned=np.empty((0, 3)),
-        picture=(),
-    )
+    def columns(self) -> list[Column]:
+        """All columns of the file: the standard deviations are before the covariance."""
+        columns = Table.columns(self)
+        first = [column.name for column in columns].index(COVARIANCE[0])
+        return [*columns[:first], *_STD.of(self.std), *columns[first:]]
 
 
 # Fused poses: one row per cycle with an encoder pose, from the first image on.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FusedTable:
+class FusedTable(Table):
     """Fused poses of n cycles.
 
     Attributes:
@@ -399,30 +202,11 @@ class FusedTable:
         age: Time since the last image used, shape (n,), [s].
     """
 
-    time: Array
-    position: Array
-    rotation: Array
-    std: Array
-    age: Array
-
-    def __len__(self) -> int:
-        return len(self.time)
-
-    def write_csv(self, path: Path) -> None:
-        """Writes ``fused.csv``.
-
-        Raises:
-            BadInput: The folder cannot be written to.
-        """
-        write_table(
-            path,
-            [
-                numbers("time_s", self.time),
-                *_pose(self.position, self.rotation),
-                *_side_by_side(_STD, self.std * _SCALES),
-                numbers("age_s", self.age),
-            ],
-        )
+    time: Annotated[Array, numbers("time_s")]
+    position: Annotated[Array, _position()]
+    rotation: Annotated[Array, _rotation()]
+    std: Annotated[Array, _STD]
+    age: Annotated[Array, numbers("age_s")]
 
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:

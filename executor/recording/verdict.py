@@ -12,12 +12,15 @@ from pathlib import Path
 import numpy as np
 
 import executor
+from drivers.can_bus import IN_PROCESS
 from executor.recording.clearance import ClearanceTable, camera_of, source_of
-from executor.recording.record_files import CameraRecord
+from executor.recording.record_files import CameraRecord, RunCourse
+from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.limits import tension_limits
 from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
+from model.plan import Plan
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene
@@ -31,6 +34,32 @@ _AFTER_MOTION = [state.value for state in (State.SECURING, State.LATCHED)]
 ROUNDING = 2e-9
 #: Distance [m] and angle [rad] of set-points from the goal at which the platform counts as there.
 AT_GOAL, AT_GOAL_ANGLE = 1e-4, 1e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RunContext:
+    """A run, besides its tables.
+
+    Attributes:
+        plan: Its plan.
+        rig: Its rig.
+        course: Its start and end.
+        events: All events, in order.
+    """
+
+    plan: Plan
+    rig: Rig
+    course: RunCourse
+    events: tuple[RunEvent, ...]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the drives were simulated, here or by a program at the other end of the bus."""
+        return self.course.simulated or bool(self.texts_of(SIMULATED))
+
+    def texts_of(self, code: str) -> list[str]:
+        """Texts of the events with a code."""
+        return [event.text for event in self.events if event.code == code]
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,47 +104,29 @@ class Verdict:
 
 
 def judge(
-    final_state: str,
-    cause: str,
-    simulated: bool,
-    rig: Rig,
-    scene: Scene,
-    cycles: CycleTable,
-    poses: PoseTable,
-    clearance: ClearanceTable,
-    cameras: Sequence[CameraRecord] = (),
-    *,
-    clearance_stop: bool = False,
-    silent: bool = False,
-    troubles: Sequence[str] = (),
-    warnings: Sequence[str] = (),
+    context: RunContext, cycles: CycleTable, poses: PoseTable, clearance: ClearanceTable
 ) -> Verdict:
     """The verdict on a run.
 
     Args:
-        final_state: ``finished``, ``stopped`` or any other for a fault.
-        cause: Why it did not finish, if it did not.
-        simulated: The drives were simulated in the run's process, so that no reply may be lost.
-        rig: Its rig.
-        scene: Its scene.
+        context: Of the run.
         cycles: Of the drives.
         poses: Fused poses of the cameras.
         clearance: Distances to obstacles.
-        cameras: Statistics of each camera's images.
-        clearance_stop: It was stopped for the measured clearance, not by the operator.
-        silent: It was stopped for drives that did not answer.
-        troubles: Missing data, a sentence each.
-        warnings: Of the drives.
     """
+    course, rig, scene = context.course, context.rig, context.plan.scene
+    final_state, began = course.final_state, cycles.path_began
+    warnings = context.texts_of("drive_warning")
+    in_process = context.simulated and course.interface == IN_PROCESS
     measured = [
         following(cycles, rig.motion.following_error),
-        replies(cycles, simulated, silent),
+        replies(cycles, in_process, bool(context.texts_of("drive_silent"))),
         *tensions(cycles, rig),
-        *distances(clearance, scene.obstacle_clearance, cameras, cycles.path_began),
+        *distances(clearance, scene.obstacle_clearance, course.cameras, began),
         *encoder_pose(cycles),
-        *camera(poses, cameras, cycles.path_began),
+        *camera(poses, course.cameras, began),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
-        *(Check("record", False, f"{trouble}.") for trouble in troubles),
+        *(Check("record", False, f"{trouble}.") for trouble in course.troubles),
     ]
     failures = [check for check in measured if not check.passed]
     at = f"after {_motion_time(cycles):.1f} s and {_travelled(cycles)} mm"
@@ -130,10 +141,12 @@ def judge(
     if final_state == NOT_ENDED:
         end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
         return Verdict(FAILED, "The run did not finish.", (end, *measured))
-    cause_text = cause.rstrip(".") or f"the final state is {final_state!r}"
+    cause = course.cause or next((event.text for event in reversed(context.events)), "")
+    cause = cause.rstrip(".") or f"the final state is {final_state!r}"
     where = "at the goal" if _is_at_goal(cycles, scene) else "before the goal"
-    end = Check("finished", False, f"The run ended {at}, {where}: {cause_text}.")
-    if final_state == "stopped" and not failures and not clearance_stop:
+    end = Check("finished", False, f"The run ended {at}, {where}: {cause}.")
+    by_operator = final_state == "stopped" and not context.texts_of("clearance_low")
+    if by_operator and not failures:
         return Verdict(STOPPED, f"The run was stopped {where}.", (end, *measured))
     word = "was stopped" if final_state == "stopped" else "ended with a fault"
     return Verdict(FAILED, f"The run {word} {where}.", (end, *measured))
@@ -158,8 +171,8 @@ def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
     """The verdict on a run whose tables could not be computed.
 
     Args:
-        final_state: As for `judge`.
-        cause: As for `judge`.
+        final_state: ``finished``, ``stopped`` or any other for a fault.
+        cause: Why it did not finish, if it did not.
         trouble: Why there are no tables.
     """
     known = Check("evaluated", False, f"The measurements could not be evaluated: {trouble}.")

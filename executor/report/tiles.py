@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from executor.recording.tables import no_poses
+from executor.recording.tables import PoseTable
 from executor.recording.verdict import faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
@@ -177,7 +177,7 @@ def camera_table(run: RunData) -> str:
 
 def _alone(run: RunData, camera: str) -> str:
     """Distance of one camera's poses from the plan, along the path as in the summary."""
-    poses = run.alone.get(camera, no_poses())
+    poses = run.alone.get(camera, PoseTable.empty())
     error = poses.error[poses.ok & (poses.time >= run.cycles.path_began)]
     return f"{float(np.sqrt(np.mean(error**2))) * 1e3:.2f} mm RMS" if len(error) else "–"
 

@@ -1,4 +1,4 @@
-"""CSV files with named columns of numbers, written by hand or by other programs."""
+"""CSV files with named columns, written by hand or by other programs; quotes in our own."""
 
 from __future__ import annotations
 
@@ -102,3 +102,10 @@ class CsvTable:
             what = f"line {line}, {name}: {text!r} is not a finite number"
             raise self.bad(what, "leave out lines that were not measured")
         return value
+
+
+def quoted(text: str) -> str:
+    """A value for a line of a CSV file, quoted where necessary; line breaks become blanks."""
+    if not any(sign in text for sign in ',"\r\n'):
+        return text
+    return '"' + text.replace('"', '""').replace("\r", " ").replace("\n", " ") + '"'

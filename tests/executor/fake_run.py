@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from executor.recording.clearance import ClearanceTable
 from executor.recording.mcap import write_mcap
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent, RunFolder
-from executor.recording.summary import RunContext, summarize
+from executor.recording.summary import summarize
 from executor.recording.tables import CycleTable, PoseTable, fused_table
+from executor.recording.verdict import RunContext
 from model.clearance import ClearanceModel
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
@@ -59,7 +61,7 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     folder = RunFolder.create(path)
     folder.write_plan(run.context.plan.document)
     folder.write_rig(run.context.rig.document)
-    started, cycles = run.context.started, len(run.cycles)
+    started, cycles = run.context.course.started, len(run.cycles)
     folder.write_course(RunCourse(started, "virtual", True, True, "finished", "", cycles))
     poses = run.poses
     if pictures:
@@ -83,6 +85,12 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     return folder
 
 
+def changed(context: RunContext, **changes: Any) -> RunContext:
+    """Another context: plan, rig, events, or a part of its course."""
+    own = {name: changes.pop(name) for name in ("plan", "rig", "events") if name in changes}
+    return replace(context, course=replace(context.course, **changes), **own)
+
+
 @lru_cache(maxsize=4)
 def make(rate_hz: float = 10.0, every: int = 1, camera: bool = True) -> FakeRun:
     """The run; ``every`` is the interval of kept cycles."""
@@ -102,14 +110,15 @@ def make(rate_hz: float = 10.0, every: int = 1, camera: bool = True) -> FakeRun:
     context = RunContext(
         plan=plan,
         rig=rig,
-        interface="virtual",
-        simulated=True,
-        fast=True,
-        started=datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC),
-        duration=float(cycles.time[-1]),
-        final_state="finished",
+        course=RunCourse(
+            datetime(2026, 3, 4, 5, 6, 7, tzinfo=UTC),
+            interface="virtual",
+            simulated=True,
+            fast=True,
+            final_state="finished",
+            versions={"cdpr": "0.1.0", "numpy": np.__version__},
+        ),
         events=events,
-        versions={"cdpr": "0.1.0", "numpy": np.__version__},
     )
     return FakeRun(context, cycles, poses, clearance)
 
@@ -212,6 +221,7 @@ def _cycles(rig: Rig, scene: Scene, every: int) -> CycleTable:
     tensions = np.column_stack([np.interp(np.arange(n), some, solved[:, i]) for i in range(m)])
     noise = np.random.default_rng(2).normal(0.0, 0.1, (n, m))
     return CycleTable(
+        cycle=np.arange(n),
         time=np.arange(n) * CYCLE * every,
         state=("moving",) * (n - 1) + ("finished",),
         path_index=np.arange(n) * every,

@@ -45,8 +45,7 @@ class Rows:
     def csv_header(self) -> str:
         return "cycle\n"
 
-    def csv_rows(self, first: int) -> str:
-        assert first == self.numbers.start
+    def csv_rows(self) -> str:
         return "".join(f"{number}\n" for number in self.numbers)
 
 

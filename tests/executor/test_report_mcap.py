@@ -74,7 +74,7 @@ def test_no_row_is_lost(run: fake_run.FakeRun, folder: RunFolder, messages: Mess
 
 
 def test_times_are_the_start_plus_run_time(run: fake_run.FakeRun, messages: Messages) -> None:
-    start = int(run.context.started.timestamp()) * 1_000_000_000
+    start = int(run.context.course.started.timestamp()) * 1_000_000_000
     times = np.array([time - start for time, _ in messages["/drives"]]) / 1e9
     np.testing.assert_allclose(times, run.cycles.time, atol=1e-9)
     stamps = [m.timestamp for _, m in messages["/tag_pose"]]
@@ -144,7 +144,7 @@ def test_cameras_that_were_not_used_name_nothing(
     """Images, frames and calibrations belong together, also of one of a rig's cameras."""
     (camera,) = run.context.rig.cameras
     cameras = tuple(replace(camera, name=name) for name in ("left", "right", "spare"))
-    context = replace(
+    context = fake_run.changed(
         run.context,
         rig=replace(run.context.rig, cameras=cameras),
         cameras=tuple(CameraRecord(name, "0", 9, 9, 0, 2.0, "") for name in used),

@@ -14,7 +14,7 @@ import pytest
 from executor.recording.clearance import no_clearance
 from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent, RunFolder
-from executor.recording.tables import CycleTable, no_poses
+from executor.recording.tables import CycleTable, PoseTable
 from executor.report import build_report
 from executor.report.run_data import read_run
 from executor.report.tiles import camera_table
@@ -169,7 +169,7 @@ def test_texts_of_files_cannot_become_markup(tmp_path: Path, run: fake_run.FakeR
     document = run.context.plan.document
     scene = document.scene.model_dump(mode="json")
     scene["name"] = scene["obstacles"][0]["name"] = evil
-    context = replace(
+    context = fake_run.changed(
         run.context,
         plan=with_scene(run, SceneDocument.model_validate(scene)),
         interface=evil,
@@ -196,7 +196,7 @@ def with_scene(run: fake_run.FakeRun, scene: SceneDocument) -> Plan:
 
 
 def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_run.FakeRun) -> None:
-    only = replace(run, poses=no_poses(), clearance=run.clearance.of("encoder"))
+    only = replace(run, poses=PoseTable.empty(), clearance=run.clearance.of("encoder"))
     page = built(only, tmp_path / "run")
     assert "Images" not in page.headings
     assert "Clearance" in page.headings
@@ -219,10 +219,10 @@ def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(
         run,
         cycles=replace(run.cycles, state=states),
         poses=poses,
-        context=replace(run.context, cameras=used),
+        context=fake_run.changed(run.context, cameras=used),
     )
     folder = fake_run.write(made, tmp_path / "run", pictures=False)
-    for camera, table in (("front", poses), ("blind", no_poses())):
+    for camera, table in (("front", poses), ("blind", PoseTable.empty())):
         folder.write_poses_of(camera, table)
     rms = made.summary["tag_error_mm"]["rms"]  # type: ignore[index]
     rows = re.findall(r"<tr>(.*?)</tr>", camera_table(read_run(folder)))
@@ -234,7 +234,7 @@ def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(
 def test_a_scene_without_obstacles_reports_it(tmp_path: Path, run: fake_run.FakeRun) -> None:
     scene = run.context.plan.document.scene.model_copy(update={"obstacles": []})
     context = replace(run.context, plan=with_scene(run, scene))
-    empty = replace(run, context=context, poses=no_poses(), clearance=no_clearance())
+    empty = replace(run, context=context, poses=PoseTable.empty(), clearance=no_clearance())
     page = built(empty, tmp_path / "run")
     assert "The scene has no obstacles." in page.text
     assert "Smallest clearance" not in page.text
@@ -244,8 +244,10 @@ def test_a_run_that_ended_before_its_first_cycle_still_has_a_page(
     tmp_path: Path, run: fake_run.FakeRun
 ) -> None:
     none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
-    context = replace(run.context, final_state="latched", fast=False)
-    early = replace(run, context=context, cycles=none, poses=no_poses(), clearance=no_clearance())
+    context = fake_run.changed(run.context, final_state="latched", fast=False)
+    early = replace(
+        run, context=context, cycles=none, poses=PoseTable.empty(), clearance=no_clearance()
+    )
     page = built(early, tmp_path / "run")
     assert page.headings[1] == "FAILED"
     assert "Position" not in page.headings
@@ -255,7 +257,8 @@ def test_a_run_that_ended_before_its_first_cycle_still_has_a_page(
 def test_a_run_in_real_time_shows_its_lateness(tmp_path: Path, run: fake_run.FakeRun) -> None:
     late = np.abs(np.random.default_rng(5).normal(0.0, 1e-4, len(run.cycles)))
     cycles = replace(run.cycles, lateness=late)
-    context = replace(run.context, fast=False, simulated=False, interface="socketcan")
+    real = {"fast": False, "simulated": False, "interface": "socketcan"}
+    context = fake_run.changed(run.context, **real)
     page = built(replace(run, cycles=cycles, context=context), tmp_path / "run")
     assert "Lateness of the cycles" in page.text
     assert "real drives, bus socketcan" in page.text

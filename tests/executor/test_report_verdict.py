@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from executor.evaluation import _context_of, _planned
+from executor.evaluation import _planned
 from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.record_files import RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.summary import _clearance, summarize
-from executor.recording.tables import CycleTable, no_poses
+from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import distances, encoder_pose, following, replies, tensions
 from executor.report.tiles import chips
 from executor.trajectory.path import rounded
@@ -31,7 +31,7 @@ def run() -> fake_run.FakeRun:
 
 
 def summary(run: fake_run.FakeRun, **context: Any) -> dict[str, Any]:
-    return replace(run, context=replace(run.context, **context)).summary
+    return replace(run, context=fake_run.changed(run.context, **context)).summary
 
 
 def rows(
@@ -116,7 +116,7 @@ def test_the_figures_are_those_of_the_tables(run: fake_run.FakeRun) -> None:
 
 
 def test_without_camera_and_obstacles_these_figures_are_null(run: fake_run.FakeRun) -> None:
-    made = replace(run, poses=no_poses(), clearance=no_clearance()).summary
+    made = replace(run, poses=PoseTable.empty(), clearance=no_clearance()).summary
     assert made["passed"]
     assert made["tag_error_mm"] is None
     assert made["clearance_mm"] is None
@@ -201,7 +201,7 @@ def test_a_stopped_run_that_broke_a_limit_is_failed(run: fake_run.FakeRun) -> No
 
 def test_a_run_of_no_cycles_fails_with_a_whole_summary(run: fake_run.FakeRun) -> None:
     none = CycleTable(**{f.name: getattr(run.cycles, f.name)[:0] for f in fields(CycleTable)})
-    early = replace(run, cycles=none, poses=no_poses(), clearance=no_clearance())
+    early = replace(run, cycles=none, poses=PoseTable.empty(), clearance=no_clearance())
     made = summary(early, final_state="latched", fast=False)
     assert made["verdict"] == "FAILED"
     assert made["following_error_mm"]["max"] is None
@@ -395,9 +395,9 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
 def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:
     """They may lose replies like real ones: the bus is real."""
     run = fake_run.make(rate_hz=1.0, every=100, camera=False)
-    course = RunCourse(run.context.started, "udp_multicast", False, False, "finished")
+    course = RunCourse(run.context.course.started, "udp_multicast", False, False, "finished")
     for events, simulated in (((), False), ((RunEvent(0.0, "simulated", ""),), True)):
-        context = _context_of(run.context.plan, run.context.rig, course, run.cycles, events)
+        context = replace(run.context, course=course, events=events)
         cycles = replace(run.cycles, missing=run.cycles.missing + (run.cycles.path_index == 0))
         summary = summarize(context, cycles, run.poses, run.clearance)
         assert summary["simulated"] is simulated

@@ -28,8 +28,6 @@ from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.recording.tables import (
     CycleTable,
     PoseTable,
-    no_cycles,
-    no_poses,
     quaternions_of,
 )
 from executor.run_result import RunResult
@@ -351,7 +349,7 @@ def test_names_of_obstacles_that_look_like_columns_do_no_harm(
 @pytest.mark.parametrize("obstacles", [(), ("a", "b")])
 def test_tables_without_rows_round_trip(tmp_path: Path, obstacles: tuple[str, ...]) -> None:
     no_clearance(obstacles).write_csv(tmp_path / "clearance.csv")
-    no_poses().write_csv(tmp_path / "poses.csv")
+    PoseTable.empty().write_csv(tmp_path / "poses.csv")
     assert ClearanceTable.read_csv(tmp_path / "clearance.csv").obstacles == obstacles
     assert len(PoseTable.read_csv(tmp_path / "poses.csv")) == 0
 
@@ -404,6 +402,13 @@ def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -
     assert (len(again), again.cable_count) == (0, 8)
 
 
+def test_a_record_without_cables_is_refused(tmp_path: Path, run: fake_run.FakeRun) -> None:
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    CycleTable.empty(cables=0).write_csv(folder.path / "cycles.csv")
+    with pytest.raises(BadInput, match=r"cycles\.csv has 0 cables, rig\.json has 8"):
+        folder.cycles()
+
+
 def test_only_the_limit_of_tables_ends_reading_a_record(
     tmp_path: Path, run: fake_run.FakeRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -422,7 +427,8 @@ def test_only_the_limit_of_tables_ends_reading_a_record(
 
 def test_the_size_of_a_record_is_known_before_the_run(run: fake_run.FakeRun) -> None:
     """Of its rows after two hours."""
-    row = len(run.cycles.csv_rows(720_000)) / len(run.cycles)
+    late = replace(run.cycles, cycle=run.cycles.cycle + 720_000)
+    row = len(late.csv_rows()) / len(late)
     assert 0.8 < row / (ROW + 8 * ROW_PER_CABLE) < 1.0
 
 
@@ -451,8 +457,8 @@ def test_the_type_of_a_column_depends_on_its_name_only(
     bare.write_poses(numbered.poses)
     bare.write_clearance(numbered.clearance)
     empty = RunFolder.create(tmp_path / "empty")
-    empty.write_cycles(no_cycles(run.cycles.cable_count))
-    empty.write_poses(no_poses())
+    empty.write_cycles(CycleTable.empty(run.cycles.cable_count))
+    empty.write_poses(PoseTable.empty())
     empty.write_clearance(no_clearance(run.clearance.obstacles))
     kinds = table_kinds(full)
     assert table_kinds(RunResult(bare.path, {})) == kinds

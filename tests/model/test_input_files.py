@@ -92,17 +92,16 @@ def test_a_field_that_never_ends_is_reported_with_its_line(tmp_path: Path) -> No
 def test_a_whole_number_past_64_bits_in_a_table_is_reported(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("n\n" + "9" * 30 + "\n")
     with pytest.raises(BadInput, match="whole number"):
-        TableFile(tmp_path / "a.csv").ints("n")
+        TableFile(tmp_path / "a.csv").column("n", int)
 
 
 @pytest.mark.parametrize("value", ["-1e308", "1.1e15", "1e400", "-inf"])
 def test_a_number_that_no_run_records_is_reported(tmp_path: Path, value: str) -> None:
     (tmp_path / "a.csv").write_text(f"x_mm,y_mm\n1,2\nnan,{value}\n")
     table = TableFile(tmp_path / "a.csv")
-    assert table.floats("x_mm")[0] == 1.0
-    for read in (lambda: table.floats("y_mm"), lambda: table.matrix(["y_mm"])):
-        with pytest.raises(BadInput, match="'y_mm' has a value beyond"):
-            read()
+    assert table.column("x_mm", float)[0] == 1.0
+    with pytest.raises(BadInput, match="'y_mm' has a value beyond"):
+        table.column("y_mm", float)
 
 
 def test_a_table_with_two_columns_of_one_name_is_refused(tmp_path: Path) -> None:

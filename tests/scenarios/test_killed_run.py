@@ -47,8 +47,8 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """The folder when the program is killed during motion."""
     folder = fake_run.write(RUN, tmp_path_factory.mktemp("killed") / "run", pictures=False)
     folder.append_event(RunEvent(99.0, "pass", "an der Säule vorbei – ¾"))
-    context = RUN.context
-    folder.write_course(RunCourse(context.started, "socketcan", False, False))
+    started = RUN.context.course.started
+    folder.write_course(RunCourse(started, "socketcan", False, False))
     for name in (*ENDED, "run.mcap"):
         (folder.path / name).unlink()
     return folder
@@ -222,8 +222,8 @@ def test_a_killed_run_has_the_start_of_its_motion_and_the_versions_that_ran_it(
     answer = call("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o", run)
     assert answer.code == 0, answer
     monkeypatch.undo()
-    context = evaluate_folder(RunFolder(killed)).context
-    assert (context.started, context.versions) == (moved, {"cdpr": "0.0.9"})
+    course = evaluate_folder(RunFolder(killed)).context.course
+    assert (course.started, course.versions) == (moved, {"cdpr": "0.0.9"})
     assert RunFolder(run).summary()["versions"] == {"cdpr": "0.0.9"}
 
 
@@ -288,7 +288,7 @@ def test_a_report_made_later_does_not_pass_what_the_cameras_failed(
     seen = run.clearance
     near = replace(seen, distance=seen.distance - 0.05, at_most=seen.at_most - 0.05)
     folder = fake_run.write(replace(run, clearance=near), tmp_path / "run", pictures=False)
-    course = RunCourse(run.context.started, "virtual", True, True, "finished")
+    course = RunCourse(run.context.course.started, "virtual", True, True, "finished")
     folder.write_course(course)
     folder.write_end_of_course(course)
     assert folder.summary()["verdict"] == "FAILED"

@@ -196,10 +196,10 @@ def test_parts_of_a_record_are_those_of_the_whole_and_an_hour_is_small(
     monkeypatch.setattr(recorder, "_CHUNK", 7)
     (tmp_path / "run").mkdir()
     log = run(prepared, tmp_path / "run")[1].log
-    whole = log.table().csv_rows(0).splitlines()
+    whole = log.table().csv_rows().splitlines()
     for first in (0, 1, 6, 7, 8, len(log) - 1, len(log)):
         for end in {min(first + count, len(log)) for count in (0, 1, 7, 20)}:
-            assert log.table(first, end).csv_rows(first).splitlines() == whole[first:end]
+            assert log.table(first, end).csv_rows().splitlines() == whole[first:end]
     assert sum(chunk.nbytes for chunk in log._chunks) / len(log) < 300.0
 
 
