@@ -81,7 +81,6 @@ export class Live {
     mark(at("rig"), "title", state.rig);
     write(at("bus"), state.bus);
     write(at("simulated"), state.simulated ? "simulated drives" : "");
-    document.title = `${motionText(state)} – ${state.rig}`;
     for (const [name, read] of Object.entries(LAMPS)) {
       const [text, kind] = read(state), lamp = at(`lamp-${name}`);
       write(lamp, text);
