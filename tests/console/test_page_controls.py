@@ -344,6 +344,30 @@ def test_homing_without_a_camera_says_that_the_pose_is_stated_and_not_measured(d
     assert desk.fake.received("home") == []
 
 
+def test_a_speed_slider_that_is_put_back_shows_the_run_s_speed_again(desk: Visit) -> None:
+    """Browsers report no change then, and nothing is sent."""
+    more = {"age_s": 0.0, "elapsed_s": 1.0, "cameras": [], "drives": [], "events": []}
+    desk.take_control()
+    desk.fake.ask(state={"motion": {**moving("moving", speed_percent=50), **more}})
+    slider, shown = desk.page.locator("#speed"), desk.page.locator("#speed-shown")
+    expect(shown).to_have_text("50 %")
+    box, mouse = slider.bounding_box(), desk.page.mouse
+    assert box
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    mouse.move(*middle)
+    mouse.down()
+    mouse.move(middle[0] + box["width"] / 4, middle[1])
+    expect(shown).not_to_have_text("50 %")
+    for step in range(-20, 20):  # back, to the value at which it was pressed
+        if slider.input_value() != "50":
+            mouse.move(middle[0] + step / 4, middle[1])
+    expect(shown).to_have_text("50 %")
+    mouse.up()
+    desk.fake.ask(state={"motion": {**moving("moving", speed_percent=100), **more}})
+    expect(shown).to_have_text("100 %")
+    assert desk.fake.received("speed") == []
+
+
 def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     """The fake server takes anything; what the real one takes is in `cdpr.console.commands`."""
     page = desk.page

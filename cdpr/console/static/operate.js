@@ -17,6 +17,7 @@ export class Operate {
   #files = {}; // names listed so far, by group
   #busy = null;
   #sliding = false; // the operator moves the slider: the run's status must not
+  #sending = false; // nor while the new speed is on its way
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
@@ -29,9 +30,12 @@ export class Operate {
       write(at("speed-shown"), `${at("speed").value} %`);
     });
     at("speed").addEventListener("change", async () => {
+      this.#sending = true;
       await page.command("speed", { percent: Number(at("speed").value) });
-      this.#sliding = false;
+      this.#sending = false;
     });
+    // After "change", which does not come if the slider was put back.
+    for (const end of ["change", "pointerup", "pointercancel", "blur"]) at("speed").addEventListener(end, () => setTimeout(() => (this.#sliding = false)));
     at("service-begin").addEventListener("click", () => this.#service());
     at("service-end").addEventListener("click", () => page.command("service_end"));
     at("cable-begin").addEventListener("click", () => this.#cables());
@@ -94,7 +98,7 @@ export class Operate {
     } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.busy ? "" : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
-    if (asked !== undefined && !this.#sliding) {
+    if (asked !== undefined && !this.#sliding && !this.#sending) {
       at("speed").value = asked;
       write(at("speed-shown"), `${Math.round(asked)} %`);
     }
