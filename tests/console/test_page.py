@@ -403,6 +403,17 @@ def test_cables_beyond_a_limit_are_named_in_newtons(desk: Visit) -> None:
     expect(desk.page.locator("#tensions li.bad")).to_have_count(2)
 
 
+def test_limits_are_shown_as_stated(desk: Visit) -> None:
+    """Rounded, they could be on the other side of a value."""
+    nearest = {"now": 7.6, "required": 7.5, "pair": ["cable 5", "obstacle_1"]}
+    limits = {"tension_limits_n": [1.5, 40.25], "tensions_n": [20, 1.4, *[20] * 6]}
+    desk.fake.ask(state={**limits, "clearance_mm": {**nearest, "points_mm": [[0, 0, 0]] * 2}})
+    page = desk.page
+    expect(page.locator("#tension-limits")).to_have_text("limits 1.5 to 40.25\u00a0N")
+    expect(page.locator("#tension-trouble")).to_contain_text("1.4\u00a0N, at least 1.5\u00a0N")
+    expect(page.locator("#note-clearance")).to_contain_text("of 7.5\u00a0mm")
+
+
 def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:
     keys = ("platform", "tensions_n", "clearance_mm", "next_stop", "preview", "motion", "busy")
     keys += ("measured",)

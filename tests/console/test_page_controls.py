@@ -331,10 +331,12 @@ def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
 
 def test_homing_without_a_camera_says_that_the_pose_is_stated_and_not_measured(desk: Visit) -> None:
     """Else the platform would be taken to be at home wherever it hangs."""
+    desk.fake.ask(state={"home_mm": [0.0, -12.0, 180.44]})
     desk.take_control()
+    desk.fake.let_pass(desk.page)
     desk.page.locator("#home").click()
     expect(desk.page.locator("#dialog .cause")).to_contain_text("held by the jig")
-    expect(desk.page.locator("#dialog .cause")).to_contain_text("0, 0, 445 mm")
+    expect(desk.page.locator("#dialog .cause")).to_contain_text("0, \u221212, 180.44 mm")
     expect(desk.page.locator(".confirm")).to_contain_text("On the jig")
     desk.page.locator("#dialog button", has_text="Cancel").click()
     desk.fake.ask(state={"homes_by": "front=0"})

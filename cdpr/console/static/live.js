@@ -1,7 +1,7 @@
 /* Live figures: lamps, position, clearance, next stop, tensions and their limits, timing of the loop. */
 
 import { isActive, isMovedByAnother } from "./buttons.js";
-import { at, capital, duration, known, make, mark, write } from "./elements.js";
+import { at, capital, duration, exact, known, make, mark, write } from "./elements.js";
 
 /** Lamps: text, and level: good (pass), bad (fail), attention (stop) or neutral (quiet). */
 const LAMPS = {
@@ -42,8 +42,8 @@ function troubleText(tensions, [low, high]) {
     return found.map((k) => `Cable ${k + 1} is ${name}: ${known(tensions[k], 1, "N")}, ${limit}`);
   };
   return [
-    ...words("slack", `at least ${known(low, 0, "N")}`, (t) => t < low),
-    ...words("too tight", `at most ${known(high, 0, "N")}`, (t) => t > high),
+    ...words("slack", `at least ${exact(low, "N")}`, (t) => t < low),
+    ...words("too tight", `at most ${exact(high, "N")}`, (t) => t > high),
   ].join(". ");
 }
 
@@ -109,7 +109,7 @@ export class Live {
     tile("clearance", known(clearance?.now, 1));
     const low = Boolean(clearance) && clearance.now < clearance.required;
     at("tile-clearance").classList.toggle("bad", low);
-    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${known(clearance.required, 0, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or unknown");
+    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${exact(clearance.required, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or unknown");
     write(at("note-measured"), measuredClearance(measured));
     tile("stop", stop ? known(stop.distance_mm, 0) : "–");
     write(at("note-stop"), stop ? `${stop.name} in ${duration(stop.seconds)}` : "none ahead");
@@ -127,7 +127,7 @@ export class Live {
     if (tensions && this.#bars.length !== tensions.length) this.#make(tensions.length, list);
     list.style.setProperty("--low", `${(100 * low) / full}%`);
     list.style.setProperty("--high", `${(100 * high) / full}%`);
-    write(at("tension-limits"), `limits ${known(low, 0)} to ${known(high, 0, "N")}`);
+    write(at("tension-limits"), `limits ${exact(low)} to ${exact(high, "N")}`);
     this.#bars.forEach(({ bar, value, row }, k) => {
       const tension = tensions?.[k] ?? null, trouble = tension === null ? null : tension < low ? "slack" : tension > high ? "too tight" : null;
       bar.style.width = `${tension === null ? 0 : Math.min(100, Math.max(0, (100 * tension) / full))}%`;

@@ -4,7 +4,7 @@ import { isActive, whyNot } from "./buttons.js";
 import { address } from "./connection.js";
 import { PlanCurves } from "./curves.js";
 import { ask } from "./dialog.js";
-import { at, chosen, duration, known, make, mark, write } from "./elements.js";
+import { at, chosen, duration, exact, known, make, mark, write } from "./elements.js";
 import { motionText } from "./live.js";
 
 export class Operate {
@@ -213,7 +213,7 @@ export class Operate {
 
   async #home() {
     const { homes_by: camera, home_mm: home } = this.#page.situation().state;
-    const onJig = `The platform must be held by the jig at the rig’s home pose, ${home.map((v) => known(v, 0)).join(", ")} mm. It is not measured: this position is stored, wherever the platform is.`;
+    const onJig = `The platform must be held by the jig at the rig’s home pose, ${home.map((v) => exact(v)).join(", ")} mm. It is not measured: this position is stored, wherever the platform is.`;
     const lines = [
       make("p", { class: "cause" }, camera === null ? onJig : `Camera ${camera} measures where the platform is.`),
       "All winches wind in slowly until every cable is taut; the platform may move a little.",
