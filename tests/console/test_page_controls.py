@@ -288,7 +288,7 @@ def test_nothing_is_cut_off_and_touch_targets_are_large(
 def test_many_cables_and_a_long_name_cover_nothing(desk: Visit) -> None:
     """At every width; that drives are simulated is always shown."""
     name = "large_hall_of_the_institute_with_a_name_of_some_length_and_number_0815"
-    read = {"at": "19:12:05", "why_not": None}
+    read = {"at": "2026-01-28T19:12:05", "why_not": None}
     for cables in (8, 10, 24):
         tensions = [8.0 + 3.5 * k for k in range(cables)]
         desk.fake.ask(state={"rig": name, "tensions_n": tensions, "drives_read": read})

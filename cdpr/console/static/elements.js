@@ -46,6 +46,13 @@ export function exact(value, unit = "") {
   return known(value, decimals.length, unit);
 }
 
+/** Local date, empty if it is today, and time of a moment. */
+export function dateAndTime(iso) {
+  const moment = new Date(iso), isToday = moment.toDateString() === new Date().toDateString();
+  const date = isToday ? "" : moment.toLocaleDateString("en-GB", { day: "numeric", month: "short" });
+  return [date, moment.toLocaleTimeString("en-GB")];
+}
+
 /** A duration as text. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";

@@ -1,7 +1,7 @@
 /* Live figures: lamps, position, clearance, next stop, tensions and their limits, timing of the loop. */
 
 import { isActive, isMovedByAnother } from "./buttons.js";
-import { at, capital, duration, exact, known, make, mark, write } from "./elements.js";
+import { at, capital, dateAndTime, duration, exact, known, make, mark, write } from "./elements.js";
 
 /** Lamps: text, and level: good (pass), bad (fail), attention (stop) or neutral (quiet). */
 const LAMPS = {
@@ -10,7 +10,10 @@ const LAMPS = {
   drives: ({ motion, jog, cable, drives_read: read, tensions_n: tensions }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.torque === "enabled").length;
     const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.torque === "holding").length;
-    if (!drives.length && read?.at) return tensions ? [`Read ${read.at}`, "quiet"] : ["Drives not read", "stop"];
+    if (!drives.length && read?.at) {
+      const [date, time] = dateAndTime(read.at);
+      return tensions ? [`Read ${date || time}`, "quiet"] : ["Drives not read", "stop"];
+    }
     if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "pass" : "quiet"];
     // After a quick stop drives hold by themselves, with torque.
     const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
@@ -31,7 +34,7 @@ const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Pla
 function readText({ drives_read: read, tensions_n: tensions }) {
   if (!read) return "";
   const why = read.why_not ? ` ${capital(read.why_not)}.` : "";
-  return `${read.at && tensions ? `Read at ${read.at}, not watched.` : ""}${why}`.trim();
+  return `${read.at && tensions ? `Read at ${dateAndTime(read.at).join(" ").trim()}, not watched.` : ""}${why}`.trim();
 }
 
 /** More than two cables in the same trouble are counted: a list would be longer than its space. */
