@@ -273,11 +273,13 @@ _FOOT_MM = 12.0
 _CAPTION_MM = 5.0
 """Height of the caption below each of several prints, [mm]."""
 _LETTERS_MM = 2.8
+_LETTER_WIDTH_MM = 0.56 * _LETTERS_MM
+"""More than the mean width of a caption's letters; of Helvetica's digits (Adobe's font metrics)."""
 RULER_MM = 100.0
 
 
-def sheet_of(print_: Print, paper: str) -> Page:
-    """A print centred on its own page, in portrait or landscape.
+def sheet_of(print_: Print, paper: str, note: str = ". This side down.") -> Page:
+    """A print centred on its own page, in portrait or landscape; a note follows its caption.
 
     Raises:
         BadInput: It does not fit, and must not be scaled or cut into tiles.
@@ -288,32 +290,36 @@ def sheet_of(print_: Print, paper: str) -> Page:
             free = np.array([width, height - _FOOT_MM - MARGIN_MM + border])
             corner = (free - 1e3 * print_.size) / 2.0
             corner[1] = min(corner[1], free[1] - border - 1e3 * (print_.size[1] + print_.quiet))
-            return _page(width, height, [(print_, corner)], f"{print_.caption}. This side down.")
+            return _page(width, height, [(print_, corner)], print_.caption + note)
     raise _too_large(print_, paper)
 
 
 def sheets_of(prints: Sequence[Print], paper: str) -> list[Page]:
-    """Several captioned prints, in rows on portrait pages.
+    """Several captioned prints, in rows on portrait pages; the largest on their own pages.
 
     Raises:
         BadInput: One of them does not fit.
     """
     width, height = PAPERS[paper]
     room = np.array([width, height - _FOOT_MM]) - 2.0 * MARGIN_MM
-    pages: list[list[tuple[Print, Array]]] = [[]]
+    alone: list[Page] = []
+    pages: list[list[tuple[Print, Array]]] = []
     x = y = deepest = 0.0
     for print_ in sorted(prints, key=lambda p: -float(p.size[1])):
         needed = 1e3 * (print_.size + 2.0 * print_.quiet) + [0.0, _CAPTION_MM]
         if (needed > room).any():
-            raise _too_large(print_, paper)
+            alone.append(sheet_of(print_, paper, note=""))
+            continue
+        caption = _LETTER_WIDTH_MM * len(print_.caption)
+        needed[0] = max(needed[0], 1e3 * print_.quiet + caption)
         if x + needed[0] > room[0]:
             x, y, deepest = 0.0, y + deepest, 0.0
-        if y + needed[1] > room[1]:
+        if not pages or y + needed[1] > room[1]:
             pages.append([])
             x, y, deepest = 0.0, 0.0, 0.0
         pages[-1].append((print_, np.array([x, y]) + MARGIN_MM + 1e3 * print_.quiet))
         x, deepest = x + float(needed[0]), max(deepest, float(needed[1]))
-    return [_page(width, height, placed, "") for placed in pages]
+    return alone + [_page(width, height, placed, "") for placed in pages]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -164,7 +164,7 @@ class Console:
             "bus": bus_name(rig),
             "simulated": is_simulated(rig),
             "homes_by": without_passwords(self.files.cameras[0]) if self.files.cameras else None,
-            "home_mm": np.round(1e3 * rig.home.position, 1).tolist(),
+            "home_mm": np.round(1e3 * rig.home.position, 3).tolist(),
             **stored_state(self._stored),
             "busy": busy_state(verb, self._line, self.plan.loading),
             "outcome": outcome_state(self.verbs.outcome),

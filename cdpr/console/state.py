@@ -6,6 +6,7 @@ import asyncio
 import math
 import os
 import pwd
+import re
 import threading
 from collections import deque
 from contextlib import suppress
@@ -101,10 +102,11 @@ def plans_and_scenes() -> dict[str, list[str]]:
     here = Path()
     plans = sorted({*here.glob("*.json"), *here.glob("plans/*.json"), *MADE.glob("*.plan.json")})
     folders = (here, here / "scenes", here / "configs")
-    scenes = sorted({path for folder in folders for path in folder.glob("*.yaml")})
+    endings = ("*.yaml", "*.yml")
+    scenes = sorted({path for folder in folders for end in endings for path in folder.glob(end)})
     found = {
-        "plans": [str(path) for path in plans if _contains(path, '"kind": "cdpr-plan"')],
-        "scenes": [str(path) for path in scenes if _contains(path, "\ngoal:")],
+        "plans": [str(path) for path in plans if _contains(path, r'"kind"\s*:\s*"cdpr-plan"')],
+        "scenes": [str(path) for path in scenes if _contains(path, r"(?m)^goal\s*:")],
     }
     named = {kind: [name for name in names if _is_text(name)] for kind, names in found.items()}
     others = [name for names in found.values() for name in names if not _is_text(name)]
@@ -116,9 +118,9 @@ def _is_text(name: str) -> bool:
     return not any("\ud800" <= character <= "\udfff" for character in name)
 
 
-def _contains(path: Path, text: str) -> bool:
+def _contains(path: Path, pattern: str) -> bool:
     with suppress(OSError), path.open(encoding="utf-8", errors="replace") as stream:
-        return text in stream.read(100_000)
+        return re.search(pattern, stream.read(100_000)) is not None
     return False
 
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Any
 
 from cdpr.console.view import RobotNow, RobotView, commanded_pose
@@ -222,7 +223,7 @@ class RobotSeen:
     Attributes:
         robot: None if no pose is known, or none fits the cables.
         tensions: [N]; None if unknown, as for a drive without torque.
-        at: Local time of these values if nothing watches the drives; None while a run reports.
+        at: ISO time of these values if nothing watches the drives; None while a run reports.
         why_not: Why some of it is unknown, or older than the last attempt to read it.
     """
 
@@ -361,7 +362,7 @@ class RobotWatch:
 
 
 def _local_time() -> str:
-    return time.strftime("%H:%M:%S")
+    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 # Images of the cameras that measure a run, with outlines of the detections.

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from executor.recording.clearance import ClearanceTable
+from executor.recording.verdict import following
 from executor.report.run_data import RunData
 from model.pages.charts import (
     DASH_DOTTED,
@@ -260,7 +261,7 @@ def _following(run: RunData) -> str:
     limit, error = run.rig.motion.following_error * 1e3, run.cycles.following_error
     known = error[np.isfinite(error)]
     if not known.size:
-        return paragraph("The following error is not known: no drive reported its position.")
+        return paragraph(following(run.cycles, run.rig.motion.following_error).text)
     largest = float(known.max())
     if largest < TOO_SMALL:
         return paragraph(

@@ -262,7 +262,7 @@ def _position(run: RunData) -> str:
         "Encoders: the pose that fits the drives' actual positions. Camera: the pose of the tags."
     )
     if run.alone:
-        text += " Fused: all cameras, weighted; the others are the poses of single cameras."
+        text += " Cameras together: weighted; the others are the poses of single cameras."
     return paragraph(text) + position_figure(run) + camera_table(run)
 
 

@@ -49,7 +49,9 @@ def chips(summary: dict[str, Any]) -> str:
         f"{drives}, bus {summary['interface']}",
         f"{time}, {summary['cycle_ms']:g} ms a cycle",
     ]
-    words.append("no camera" if summary["tag_error_mm"] is None else "camera and tags")
+    has_images = summary["tag_error_mm"] is not None
+    without = "camera without images" if summary["cameras"] else "no camera"
+    words.append("camera and tags" if has_images else without)
     return f'<ul class="chips">{"".join(f"<li>{escape(word)}</li>" for word in words)}</ul>'
 
 

@@ -112,7 +112,7 @@ def _content(maps: Maps) -> tuple[str, str, dict[str, Draw]]:
     if name == "frame":
         text = (
             "The paper's Fig. 6: where the cables can balance any wrench, and where the tension"
-            " limits suffice; red: frame of the outlets, grey: workspace box."
+            " limits suffice; the boxes are the frame of the outlets and, in it, the workspace."
         )
         return "The whole frame", text, {name: partial(space_figure, maps)}
     chosen = [quantity for quantity in shown_in(maps) if quantity.name in _LEVELS_OF]

@@ -5,9 +5,11 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import matplotlib
 import numpy as np
 import pytest
 
@@ -122,6 +124,44 @@ def test_single_tags_are_printed_in_their_sizes_with_their_names() -> None:
         8: pytest.approx(30.0, abs=0.5),
     }
     assert any("tag36h11 301, black square 96 mm" in text for text in named)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.03, 0.04, 0.06])
+def test_captions_of_small_tags_are_apart_and_on_the_paper(size: float) -> None:
+    """By the widths of Helvetica's letters; without its caption a tag cannot be told apart."""
+    afm = Path(matplotlib.get_data_path(), "fonts", "pdfcorefonts", "Helvetica.afm").read_text()
+    widths = {int(c): int(w) for c, w in re.findall(r"^C (\d+) ; WX (\d+)", afm, re.MULTILINE)}
+    made = tag_print("tag36h11", 301, size)
+    pages = sheets_of([replace(made, caption=f"{made.caption}, platform")] * 12, "a4")
+    rows: dict[tuple[int, float], list[tuple[float, float]]] = {}
+    for number, page in enumerate(pages):
+        for text in page.texts:
+            if text.text.startswith("tag"):
+                width = sum(widths[ord(c)] for c in text.text) * text.size_mm / 1000.0
+                row = rows.setdefault((number, text.y_mm), [])
+                row.append((text.x_mm, text.x_mm + width))
+    assert sum(map(len, rows.values())) == 12
+    for row in rows.values():
+        ends = [end for _, end in row]
+        assert (np.array(ends[:-1]) < [start for start, _ in row[1:]]).all()
+        assert ends[-1] <= PAPERS["a4"][0] - MARGIN_MM
+
+
+@pytest.mark.parametrize(("paper", "size"), [("a4", 0.165), ("letter", 0.170)])
+def test_a_tag_that_needs_its_own_page_has_one(paper: str, size: float) -> None:
+    """Its white border and the printer's margin may overlap there."""
+    prints = [tag_print("tag36h11", 301, size), tag_print("tag36h11", 302, 0.03)]
+    alone, other = sheets_of(prints, paper)
+    assert [t.text for t in alone.texts if t.text.startswith("tag")] == [prints[0].caption]
+    assert [t.text for t in other.texts if t.text.startswith("tag")] == [prints[1].caption]
+    assert len(sheets_of(prints[:1], paper)) == 1
+
+
+def test_a_refused_tag_is_never_referred_to_the_paper_it_does_not_fit() -> None:
+    for size in (0.169, 0.19, 0.24):
+        with pytest.raises(BadInput) as caught:
+            sheets_of([tag_print("tag36h11", 301, size)], "a4")
+        assert "a4" not in caught.value.next_step
 
 
 def test_a_board_that_does_not_fit_is_refused_with_the_paper_that_would_do() -> None:

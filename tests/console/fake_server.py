@@ -464,7 +464,7 @@ class Fake:
         elif command == "reset":
             self.latched = None
         elif command == "read_drives":
-            self.over["drives_read"] = {"at": "19:12:05", "why_not": None}
+            self.over["drives_read"] = {"at": "2026-01-02T19:12:05+09:00", "why_not": None}
         elif command in ("home", "release"):
             self.homed = command == "home"
         elif command == "load_plan":

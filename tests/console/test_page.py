@@ -151,6 +151,7 @@ def test_stale_data_say_so_over_the_whole_view_and_leave_only_stop(desk: Visit) 
     expect(desk.page.locator("#stale .band")).to_be_visible(timeout=1500)
     expect(desk.page.locator("#stale-text")).to_have_text(STALE)
     assert desk.audit("usable") == ["stop"]
+    expect(desk.page).to_have_title(re.compile("^No current data – "))
     box = desk.page.locator("#stale .band").bounding_box()
     assert box
     assert box["width"] == SIZES["desk"][0]
@@ -160,7 +161,51 @@ def test_stale_data_say_so_over_the_whole_view_and_leave_only_stop(desk: Visit) 
         assert desk.page.locator(figure).first.evaluate(muted), figure
     desk.fake.ask(silent=False)
     expect(desk.page.locator("#stale")).to_be_hidden()
+    expect(desk.page).to_have_title(re.compile("^At rest – "))
     assert len(desk.audit("usable")) > 10
+
+
+def test_a_hidden_tab_has_a_current_title_and_misses_no_event(desk: Visit) -> None:
+    """Browsers draw no frames for it."""
+    without_frames = """() => {
+      globalThis.drawn = globalThis.requestAnimationFrame;
+      globalThis.waiting = [];
+      globalThis.requestAnimationFrame = (frame) => waiting.push(frame);
+    }"""
+    desk.page.evaluate(without_frames)
+    events = [{"time_s": 1.5, "code": "slack", "text": "cable 3 carries 1.8 N"}]
+    desk.fake.ask(set={"moving": "moving", "events": events})
+    expect(desk.page).to_have_title(re.compile("^Moving"))
+    desk.fake.ask(set={"moving": None, "latched": "slack"})
+    expect(desk.page).to_have_title(re.compile("^Fault latched"))
+    shown_again = """() => {
+      globalThis.requestAnimationFrame = drawn;
+      waiting.forEach((frame) => drawn(frame));
+    }"""
+    desk.page.evaluate(shown_again)
+    desk.view("events")
+    expect(desk.page.locator("#events li").first).to_contain_text("cable 3 carries 1.8 N")
+    expect(desk.page.locator("#events-none")).to_be_hidden()
+
+
+def test_curves_have_a_gap_where_no_state_arrived(desk: Visit) -> None:
+    """A line across it would show a dip in it as a steady value."""
+    draw = """async () => {
+      const { Curves } = await import("/static/curves.js");
+      const drawn = [], kept = globalThis.uPlot, curves = new Curves();
+      globalThis.uPlot = class { setData(data) { drawn.push(data); } setSize() {} redraw() {} };
+      const tensions_n = Array(8).fill(20), tension_limits_n = [5, 100];
+      const clearance_mm = { now: 80, required: 10 }, motion = { following_error_mm: 0.2 };
+      const state = { tensions_n, tension_limits_n, clearance_mm, motion };
+      for (const now of [1000, 1050, 30000, 30050]) curves.take(state, now);
+      curves.show(30050);
+      globalThis.uPlot = kept;
+      return drawn;
+    }"""
+    tensions, clearance, following = desk.page.evaluate(draw)
+    for curve, value in ((tensions[8], 20), (clearance[1], 80), (following[1], 0.2)):
+        assert curve == [value, value, None, value, value]
+    assert following[0] == pytest.approx([-29.05, -29.0, -29.0, -0.05, 0.0])
 
 
 def test_the_age_grows_by_the_page_s_own_clock(desk: Visit) -> None:
@@ -356,6 +401,17 @@ def test_cables_beyond_a_limit_are_named_in_newtons(desk: Visit) -> None:
     expect(trouble).to_contain_text(re.compile(r"Cable 3 is slack: 1\.8\sN, at least 5\sN"))
     expect(trouble).to_contain_text(re.compile(r"Cable 7 is too tight: 104\.2\sN, at most 100\sN"))
     expect(desk.page.locator("#tensions li.bad")).to_have_count(2)
+
+
+def test_limits_are_shown_as_stated(desk: Visit) -> None:
+    """Rounded, they could be on the other side of a value."""
+    nearest = {"now": 7.6, "required": 7.5, "pair": ["cable 5", "obstacle_1"]}
+    limits = {"tension_limits_n": [1.5, 40.25], "tensions_n": [20, 1.4, *[20] * 6]}
+    desk.fake.ask(state={**limits, "clearance_mm": {**nearest, "points_mm": [[0, 0, 0]] * 2}})
+    page = desk.page
+    expect(page.locator("#tension-limits")).to_have_text("limits 1.5 to 40.25\u00a0N")
+    expect(page.locator("#tension-trouble")).to_contain_text("1.4\u00a0N, at least 1.5\u00a0N")
+    expect(page.locator("#note-clearance")).to_contain_text("of 7.5\u00a0mm")
 
 
 def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:

@@ -288,7 +288,7 @@ def test_nothing_is_cut_off_and_touch_targets_are_large(
 def test_many_cables_and_a_long_name_cover_nothing(desk: Visit) -> None:
     """At every width; that drives are simulated is always shown."""
     name = "large_hall_of_the_institute_with_a_name_of_some_length_and_number_0815"
-    read = {"at": "19:12:05", "why_not": None}
+    read = {"at": "2026-01-28T19:12:05", "why_not": None}
     for cables in (8, 10, 24):
         tensions = [8.0 + 3.5 * k for k in range(cables)]
         desk.fake.ask(state={"rig": name, "tensions_n": tensions, "drives_read": read})
@@ -331,10 +331,12 @@ def test_everything_has_a_name_and_is_reached_by_keyboard(desk: Visit) -> None:
 
 def test_homing_without_a_camera_says_that_the_pose_is_stated_and_not_measured(desk: Visit) -> None:
     """Else the platform would be taken to be at home wherever it hangs."""
+    desk.fake.ask(state={"home_mm": [0.0, -12.0, 180.44]})
     desk.take_control()
+    desk.fake.let_pass(desk.page)
     desk.page.locator("#home").click()
     expect(desk.page.locator("#dialog .cause")).to_contain_text("held by the jig")
-    expect(desk.page.locator("#dialog .cause")).to_contain_text("0, 0, 445 mm")
+    expect(desk.page.locator("#dialog .cause")).to_contain_text("0, \u221212, 180.44 mm")
     expect(desk.page.locator(".confirm")).to_contain_text("On the jig")
     desk.page.locator("#dialog button", has_text="Cancel").click()
     desk.fake.ask(state={"homes_by": "front=0"})
@@ -342,6 +344,30 @@ def test_homing_without_a_camera_says_that_the_pose_is_stated_and_not_measured(d
     desk.page.locator("#home").click()
     expect(desk.page.locator("#dialog .cause")).to_contain_text("Camera front=0 measures")
     assert desk.fake.received("home") == []
+
+
+def test_a_speed_slider_that_is_put_back_shows_the_run_s_speed_again(desk: Visit) -> None:
+    """Browsers report no change then, and nothing is sent."""
+    more = {"age_s": 0.0, "elapsed_s": 1.0, "cameras": [], "drives": [], "events": []}
+    desk.take_control()
+    desk.fake.ask(state={"motion": {**moving("moving", speed_percent=50), **more}})
+    slider, shown = desk.page.locator("#speed"), desk.page.locator("#speed-shown")
+    expect(shown).to_have_text("50 %")
+    box, mouse = slider.bounding_box(), desk.page.mouse
+    assert box
+    middle = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    mouse.move(*middle)
+    mouse.down()
+    mouse.move(middle[0] + box["width"] / 4, middle[1])
+    expect(shown).not_to_have_text("50 %")
+    for step in range(-20, 20):  # back, to the value at which it was pressed
+        if slider.input_value() != "50":
+            mouse.move(middle[0] + step / 4, middle[1])
+    expect(shown).to_have_text("50 %")
+    mouse.up()
+    desk.fake.ask(state={"motion": {**moving("moving", speed_percent=100), **more}})
+    expect(shown).to_have_text("100 %")
+    assert desk.fake.received("speed") == []
 
 
 def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:

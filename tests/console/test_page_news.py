@@ -229,10 +229,13 @@ def test_values_read_at_rest_are_not_shown_as_live(desk: Visit) -> None:
       === getComputedStyle(document.querySelector('.quiet')).color"""
     expect(said).to_be_hidden()
     assert not value.evaluate(quiet)
-    read = {"at": "19:12:05", "why_not": None}
+    today = desk.page.evaluate("() => new Date().toISOString()")
+    desk.fake.ask(state={"drives_read": {"at": today, "why_not": None}})
+    expect(said).to_have_text(re.compile(r"^Read at \d\d:\d\d:\d\d, not watched\.$"))
+    read = {"at": "2026-01-02T19:12:05", "why_not": None}
     desk.fake.ask(state={"drives_read": read})
-    expect(said).to_have_text("Read at 19:12:05, not watched.")
-    expect(lamp).to_have_text("Read 19:12:05")
+    expect(said).to_have_text("Read at 2 Jan 19:12:05, not watched.")
+    expect(lamp).to_have_text("Read 2 Jan")
     for figure in (value, desk.page.locator("#tile-clearance dd")):
         assert figure.evaluate(quiet)
     released = {"platform": None, "clearance_mm": None, "tensions_n": [0.0] * 8}

@@ -44,7 +44,7 @@ from cdpr.console.commands import (
 )
 from cdpr.console.server import MOST_PAGES, ConsoleServer, listening, web_server
 from cdpr.console.session import LONGEST_WAIT, Console
-from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState
+from cdpr.console.state import MOST_IN_TRANSIT, StateFlow, StoredState, plans_and_scenes
 from cdpr.console.verbs import (
     ConsoleFiles,
     VerbOutcome,
@@ -275,6 +275,18 @@ def test_a_file_whose_name_is_no_text_is_left_out_of_the_lists_and_named(
     listed = json.loads(body)
     assert (listed["plans"], listed["left_out"]) == (["short.json"], ["bad\ufffd.json"])
     assert json.loads(served.get("/api/files")[1])["left_out"] == []
+
+
+def test_every_plan_and_scene_that_can_be_loaded_is_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "compact.json").write_text('{"kind":"cdpr-plan"}')
+    (tmp_path / "lab.yml").write_text("start: {}\ngoal: {}\n")
+    (tmp_path / "goal-first.yaml").write_text("goal: {}\n")
+    (tmp_path / "rig.yaml").write_text("name: a\n")
+    found = plans_and_scenes()
+    assert (found["plans"], found["scenes"]) == (["compact.json"], ["goal-first.yaml", "lab.yml"])
 
 
 @pytest.mark.parametrize("name", ["%00", "one/%00", "x" * 5000, "one", "../secret.txt", "%ff"])

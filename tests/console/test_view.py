@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -221,6 +222,7 @@ def test_what_is_not_read_at_rest_is_not_shown_as_known(
     assert seen.robot is not None
     assert (seen.tensions, seen.why_not) == ([20.0] * 8, None)
     assert seen.at is not None, "nothing watches the drives at rest"
+    assert datetime.fromisoformat(seen.at).tzinfo is not None, "the page may be elsewhere"
     drives.move(THE_RIG.home)
     assert drives.watch.now.as_dict() is None, "live"
     drives.reading = reading

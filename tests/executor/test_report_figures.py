@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from executor.recording.run_folder import RunEvent
-from executor.report.figures import _coordinate, _difference, _error, _obstacle, _smallest
+from executor.report.figures import (
+    _coordinate,
+    _difference,
+    _error,
+    _following,
+    _obstacle,
+    _smallest,
+)
 from executor.report.page import run_scene
 from executor.report.tiles import event_table
 from model.pages.charts import spread, thinned, with_gaps
@@ -229,3 +236,15 @@ def test_the_events_have_a_column_of_fault_pages_only_where_one_has_a_page() -> 
     ill = RunEvent(time_s=1.0, code="late", text="a cycle began 2 cycles late")
     assert "More about it" not in event_table(SimpleNamespace(events=(fine,)))
     assert "docs/faults/late.md" in event_table(SimpleNamespace(events=(fine, ill)))
+
+
+def test_why_no_following_error_was_measured_is_that_of_the_verdict() -> None:
+    """Drives that are being enabled report positions, and follow nothing."""
+    run = fake_run.make(rate_hz=2.0, every=20)
+    count = len(run.cycles)
+    unknown = replace(run.cycles, following_error=np.full(count, np.nan))
+    enabling = replace(unknown, state=("enabling",) * count)
+    silent = replace(unknown, missing=np.full(count, run.cycles.cable_count))
+    for cycles, text in ((enabling, "did not move along the path"), (silent, "was ever received")):
+        said: Any = SimpleNamespace(rig=run.context.rig, cycles=cycles)
+        assert text in _following(said)

@@ -17,7 +17,7 @@ from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.tables import CycleTable, PoseTable
 from executor.report import build_report
 from executor.report.run_data import read_run
-from executor.report.tiles import camera_table
+from executor.report.tiles import camera_table, chips
 from model.errors import BadInput
 from model.files.rig_file import PulleysDocument
 from model.files.scene_file import SceneDocument
@@ -201,6 +201,15 @@ def test_a_run_without_camera_has_no_camera_section(tmp_path: Path, run: fake_ru
     assert "Images" not in page.headings
     assert "Clearance" in page.headings
     assert "no camera" in page.text
+
+
+def test_a_camera_without_images_is_not_called_no_camera(run: fake_run.FakeRun) -> None:
+    summary = {**run.summary, "tag_error_mm": None}
+    assert "no camera" in chips(summary)
+    failed = {"name": "ceiling", "pictures": 0, "failed": "it was unplugged"}
+    found = chips({**summary, "cameras": [failed]})
+    assert "no camera" not in found
+    assert "camera without images" in found
 
 
 def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(

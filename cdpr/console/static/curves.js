@@ -1,5 +1,6 @@
 /* Curves over time (uPlot): the last minute of tensions, clearance and following error, and the curves of a plan. */
 
+import { STALE_S } from "./connection.js";
 import { at, known, make, write } from "./elements.js";
 
 const SECONDS = 60, REDRAW_MS = 250, HEIGHT = 140, SERIES = 8;
@@ -62,12 +63,17 @@ export class Curves {
   #drawn = 0;
   #limits = [0, 0];
 
-  /** Takes a state received at `now`, [ms]. */
-  show(state, now) {
+  /** Takes a state received at `now`, [ms]; the curves have a gap where none was. */
+  take(state, now) {
     const { tensions_n: tensions, clearance_mm: clearance, motion } = state;
     this.#limits = state.tension_limits_n;
+    const last = this.#rows.at(-1)?.at ?? Infinity;
+    if (now / 1000 - last > STALE_S) this.#rows.push({ at: last, tensions: null, clearance: null, required: null, following: null });
     this.#rows.push({ at: now / 1000, tensions, clearance: clearance?.now ?? null, required: clearance?.required ?? null, following: motion?.following_error_mm ?? null });
     while (this.#rows[0].at < now / 1000 - SECONDS) this.#rows.shift();
+  }
+
+  show(now) {
     if (now - this.#drawn < REDRAW_MS || document.hidden || !at("live").checkVisibility()) return;
     this.#drawn = now;
     this.#draw(now / 1000);

@@ -40,6 +40,19 @@ export function known(value, digits, unit = "") {
   return unit && number !== "–" ? `${number}\u00a0${unit}` : number;
 }
 
+/** A limit or a set value: rounded, it could be on the other side of a measured value. */
+export function exact(value, unit = "") {
+  const [, decimals = ""] = String(Number(value.toPrecision(6))).split(".");
+  return known(value, decimals.length, unit);
+}
+
+/** Local date, empty if it is today, and time of a moment. */
+export function dateAndTime(iso) {
+  const moment = new Date(iso), isToday = moment.toDateString() === new Date().toDateString();
+  const date = isToday ? "" : moment.toLocaleDateString("en-GB", { day: "numeric", month: "short" });
+  return [date, moment.toLocaleTimeString("en-GB")];
+}
+
 /** A duration as text. */
 export function duration(seconds) {
   if (seconds === null || seconds === undefined) return "–";

@@ -18,17 +18,18 @@ export class Events {
   #seen = new Set();
   #rows = [];
 
-  show({ motion }) {
-    let added = false;
+  take({ motion }) {
     for (const event of motion?.events ?? []) {
       const key = `${motion.process} ${event.time_s} ${event.code} ${event.text}`;
       if (this.#seen.has(key)) continue;
       this.#seen.add(key);
       this.#rows.unshift(row(event));
-      added = true;
     }
     if (this.#rows.length > MOST) this.#rows.length = MOST;
-    if (added) at("events").replaceChildren(...this.#rows);
+  }
+
+  show({ motion }) {
+    if (at("events").firstChild !== (this.#rows[0] ?? null)) at("events").replaceChildren(...this.#rows);
     at("events-none").hidden = this.#rows.length > 0;
     const shown = at("panel-events").checkVisibility();
     if (!shown) return;

@@ -1,6 +1,6 @@
 /* The jog panels of the platform and of one cable: buttons, keys and a gamepad hold the single press of hold.js. */
 
-import { at, capital, chosen, known, make, mark, write } from "./elements.js";
+import { at, capital, chosen, exact, known, make, mark, write } from "./elements.js";
 import { Hold } from "./hold.js";
 import { whyNot } from "./buttons.js";
 
@@ -126,7 +126,7 @@ function showCable({ cable: jog, tensions_n: tensions, tension_limits_n: [low, h
   at("cable-bar").style.width = `${tension === null ? 0 : Math.min(100, Math.max(0, (100 * tension) / full))}%`;
   at("cable-bar").style.background = tension === null ? "" : globalThis.tensionColour((tension - low / 2) / (limit - low / 2));
   write(at("cable-tension"), number ? `Cable ${number}: ${known(tension, 1, "N")}` : "No cable data yet");
-  write(at("cable-range"), `slack below ${known(low / 2, 1, "N")}, limit ${known(limit, 0, "N")}`);
+  write(at("cable-range"), `slack below ${exact(low / 2, "N")}, limit ${exact(limit, "N")}`);
   const sense = (mm) => (Math.abs(mm) < 0.0005 ? "not moved" : `${known(Math.abs(mm), 3, "mm")} ${mm > 0 ? "paid out" : "wound in"}`);
   const own = jog.cable === number ? `This press: ${sense(jog.press_mm)} · since` : "Since";
   write(at("cable-travel"), jog.ready && number ? `${own} the session began ${sense(jog.session_mm[number - 1])}` : "");

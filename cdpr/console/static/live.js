@@ -1,7 +1,7 @@
 /* Live figures: lamps, position, clearance, next stop, tensions and their limits, timing of the loop. */
 
 import { isActive, isMovedByAnother } from "./buttons.js";
-import { at, capital, duration, known, make, mark, write } from "./elements.js";
+import { at, capital, dateAndTime, duration, exact, known, make, mark, write } from "./elements.js";
 
 /** Lamps: text, and level: good (pass), bad (fail), attention (stop) or neutral (quiet). */
 const LAMPS = {
@@ -10,7 +10,10 @@ const LAMPS = {
   drives: ({ motion, jog, cable, drives_read: read, tensions_n: tensions }) => {
     const drives = motion?.drives ?? [], on = drives.filter((d) => d.torque === "enabled").length;
     const ready = jog.ready || cable.ready, holding = drives.filter((d) => d.torque === "holding").length;
-    if (!drives.length && read?.at) return tensions ? [`Read ${read.at}`, "quiet"] : ["Drives not read", "stop"];
+    if (!drives.length && read?.at) {
+      const [date, time] = dateAndTime(read.at);
+      return tensions ? [`Read ${date || time}`, "quiet"] : ["Drives not read", "stop"];
+    }
     if (!drives.length) return [ready ? "Drives on" : "No drive data", ready ? "pass" : "quiet"];
     // After a quick stop drives hold by themselves, with torque.
     const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
@@ -31,7 +34,7 @@ const BEFORE = { run: "Preparing the run", home: "Preparing to home", plan: "Pla
 function readText({ drives_read: read, tensions_n: tensions }) {
   if (!read) return "";
   const why = read.why_not ? ` ${capital(read.why_not)}.` : "";
-  return `${read.at && tensions ? `Read at ${read.at}, not watched.` : ""}${why}`.trim();
+  return `${read.at && tensions ? `Read at ${dateAndTime(read.at).join(" ").trim()}, not watched.` : ""}${why}`.trim();
 }
 
 /** More than two cables in the same trouble are counted: a list would be longer than its space. */
@@ -42,8 +45,8 @@ function troubleText(tensions, [low, high]) {
     return found.map((k) => `Cable ${k + 1} is ${name}: ${known(tensions[k], 1, "N")}, ${limit}`);
   };
   return [
-    ...words("slack", `at least ${known(low, 0, "N")}`, (t) => t < low),
-    ...words("too tight", `at most ${known(high, 0, "N")}`, (t) => t > high),
+    ...words("slack", `at least ${exact(low, "N")}`, (t) => t < low),
+    ...words("too tight", `at most ${exact(high, "N")}`, (t) => t > high),
   ].join(". ");
 }
 
@@ -81,7 +84,6 @@ export class Live {
     mark(at("rig"), "title", state.rig);
     write(at("bus"), state.bus);
     write(at("simulated"), state.simulated ? "simulated drives" : "");
-    document.title = `${motionText(state)} – ${state.rig}`;
     for (const [name, read] of Object.entries(LAMPS)) {
       const [text, kind] = read(state), lamp = at(`lamp-${name}`);
       write(lamp, text);
@@ -110,7 +112,7 @@ export class Live {
     tile("clearance", known(clearance?.now, 1));
     const low = Boolean(clearance) && clearance.now < clearance.required;
     at("tile-clearance").classList.toggle("bad", low);
-    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${known(clearance.required, 0, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or unknown");
+    write(at("note-clearance"), clearance ? `${low ? "below" : "of"} ${exact(clearance.required, "mm")} · ${clearance.pair.join(" – ")}` : "no obstacle near, or unknown");
     write(at("note-measured"), measuredClearance(measured));
     tile("stop", stop ? known(stop.distance_mm, 0) : "–");
     write(at("note-stop"), stop ? `${stop.name} in ${duration(stop.seconds)}` : "none ahead");
@@ -128,7 +130,7 @@ export class Live {
     if (tensions && this.#bars.length !== tensions.length) this.#make(tensions.length, list);
     list.style.setProperty("--low", `${(100 * low) / full}%`);
     list.style.setProperty("--high", `${(100 * high) / full}%`);
-    write(at("tension-limits"), `limits ${known(low, 0)} to ${known(high, 0, "N")}`);
+    write(at("tension-limits"), `limits ${exact(low)} to ${exact(high, "N")}`);
     this.#bars.forEach(({ bar, value, row }, k) => {
       const tension = tensions?.[k] ?? null, trouble = tension === null ? null : tension < low ? "slack" : tension > high ? "too tight" : null;
       bar.style.width = `${tension === null ? 0 : Math.min(100, Math.max(0, (100 * tension) / full))}%`;

@@ -7,7 +7,7 @@ import { cancelDialog, checkDialog } from "./dialog.js";
 import { at, chosen, known, mark, write } from "./elements.js";
 import { Events } from "./events.js";
 import { bindJog } from "./jog.js";
-import { Live } from "./live.js";
+import { Live, motionText } from "./live.js";
 import { News } from "./news.js";
 import { Operate } from "./operate.js";
 import { Pick } from "./pick.js";
@@ -86,8 +86,15 @@ view("live");
 
 guardButtons(document.body, say);
 
+/** Of a hidden tab, the title is all that is seen. */
+function showTitle() {
+  const { state } = connection;
+  if (state) write(document.querySelector("title"), `${connection.freshness().why ? "No current data" : motionText(state)} – ${state.rig}`);
+}
+
 function showAge() {
   const { why, age } = connection.freshness();
+  showTitle();
   document.body.classList.toggle("stale", why !== null);
   at("stale").hidden = why === null;
   if (why) write(at("stale-text"), why);
@@ -110,6 +117,10 @@ connection.addEventListener("refused", ({ detail }) => {
 });
 connection.addEventListener("age", showAge);
 connection.addEventListener("state", () => {
+  // Of every state: a hidden tab has no frames.
+  events.take(connection.state);
+  curves.take(connection.state, performance.now());
+  showTitle();
   if (waiting) return;
   waiting = true;
   requestAnimationFrame(() => {
@@ -117,7 +128,7 @@ connection.addEventListener("state", () => {
     const { state } = connection;
     live.show(state);
     scene.show(state);
-    curves.show(state, performance.now());
+    curves.show(performance.now());
     events.show(state);
     pictures.show(state);
     operate.show(state);

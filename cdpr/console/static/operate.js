@@ -4,7 +4,7 @@ import { isActive, whyNot } from "./buttons.js";
 import { address } from "./connection.js";
 import { PlanCurves } from "./curves.js";
 import { ask } from "./dialog.js";
-import { at, chosen, duration, known, make, mark, write } from "./elements.js";
+import { at, chosen, duration, exact, known, make, mark, write } from "./elements.js";
 import { motionText } from "./live.js";
 
 export class Operate {
@@ -17,6 +17,7 @@ export class Operate {
   #files = {}; // names listed so far, by group
   #busy = null;
   #sliding = false; // the operator moves the slider: the run's status must not
+  #sending = false; // nor while the new speed is on its way
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
@@ -29,9 +30,12 @@ export class Operate {
       write(at("speed-shown"), `${at("speed").value} %`);
     });
     at("speed").addEventListener("change", async () => {
+      this.#sending = true;
       await page.command("speed", { percent: Number(at("speed").value) });
-      this.#sliding = false;
+      this.#sending = false;
     });
+    // After "change", which does not come if the slider was put back.
+    for (const end of ["change", "pointerup", "pointercancel", "blur"]) at("speed").addEventListener(end, () => setTimeout(() => (this.#sliding = false)));
     at("service-begin").addEventListener("click", () => this.#service());
     at("service-end").addEventListener("click", () => page.command("service_end"));
     at("cable-begin").addEventListener("click", () => this.#cables());
@@ -94,7 +98,7 @@ export class Operate {
     } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.busy ? "" : "Nothing is moving.");
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
-    if (asked !== undefined && !this.#sliding) {
+    if (asked !== undefined && !this.#sliding && !this.#sending) {
       at("speed").value = asked;
       write(at("speed-shown"), `${Math.round(asked)} %`);
     }
@@ -209,7 +213,7 @@ export class Operate {
 
   async #home() {
     const { homes_by: camera, home_mm: home } = this.#page.situation().state;
-    const onJig = `The platform must be held by the jig at the rig’s home pose, ${home.map((v) => known(v, 0)).join(", ")} mm. It is not measured: this position is stored, wherever the platform is.`;
+    const onJig = `The platform must be held by the jig at the rig’s home pose, ${home.map((v) => exact(v)).join(", ")} mm. It is not measured: this position is stored, wherever the platform is.`;
     const lines = [
       make("p", { class: "cause" }, camera === null ? onJig : `Camera ${camera} measures where the platform is.`),
       "All winches wind in slowly until every cable is taut; the platform may move a little.",
