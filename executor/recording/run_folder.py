@@ -29,10 +29,11 @@ from executor.recording.record_files import (
 )
 from executor.recording.tables import CycleTable, FusedTable, PoseTable, no_cycles
 from model.errors import BadInput, Fault, InvalidFile
-from model.files.documents import problems_of, write_atomic
+from model.files.documents import write_atomic
 from model.files.plan_file import PlanDocument
 from model.files.reading import PICTURE_LIMIT, read_bytes, read_json
 from model.files.rig_file import RigDocument
+from model.files.validation import problems_of
 from model.plan import Plan, load_plan, save_plan
 from model.rig import Rig, rig_from_document
 

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.errors import BadInput, CdprError, InvalidFile
-from model.files.documents import key_path
 from model.files.rig_file import RigDocument
+from model.files.validation import key_path
 from model.rig import load_rig, rig_from_document
 from tests.model.rig_builds import CONFIGS, hall_data, paper_data, rig_of
 
