@@ -129,6 +129,21 @@ def _has_length_one(vector: list[float]) -> list[float]:
 
 UnitVector = Annotated[Vector, AfterValidator(_has_length_one)]
 
+
+def _holds_whole(annotation: Any) -> bool:
+    """Whether a key holds whole numbers, alone, in lists or optionally."""
+    is_whole = annotation is int or type(annotation) is int  # one of a `Literal`
+    return is_whole or any(map(_holds_whole, getattr(annotation, "__args__", ())))
+
+
+def _whole(value: Any) -> Any:
+    """A float that is a whole number as such, also in lists; not one with rounded digits."""
+    if isinstance(value, list):
+        return [_whole(entry) for entry in value]
+    is_whole = isinstance(value, float) and value.is_integer() and abs(value) <= 2**53
+    return int(value) if is_whole else value
+
+
 Finding = tuple[tuple[str | int, ...], str]
 """Path of a key, and a sentence that states its problem."""
 
@@ -140,6 +155,15 @@ class Document(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_whole_numbers(cls, data: Any) -> Any:
+        """Takes 1e6 and 1000000.0 for whole numbers."""
+        if not isinstance(data, dict):
+            return data
+        keys = [key for key, field in cls.model_fields.items() if _holds_whole(field.annotation)]
+        return data | {key: _whole(data[key]) for key in keys if key in data}
 
     @model_validator(mode="after")
     def _fix_lists(self) -> Self:
