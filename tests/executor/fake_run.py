@@ -59,8 +59,12 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     folder = RunFolder.create(path)
     folder.write_plan(run.context.plan.document)
     folder.write_rig(run.context.rig.document)
-    started, cycles = run.context.started, len(run.cycles)
-    folder.write_course(RunCourse(started, "virtual", True, True, "finished", "", cycles))
+    folder.write_course(
+        RunCourse(
+            *(run.context.started, "virtual", True, True, "finished", "", len(run.cycles)),
+            cameras=run.context.cameras,
+        )
+    )
     poses = run.poses
     if pictures:
         rows = set(range(0, len(poses), 20))
