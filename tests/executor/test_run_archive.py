@@ -23,6 +23,7 @@ from executor.evaluation import evaluate_folder, rewrite_report, write_end
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunFolder
+from executor.report.figures import clearance_figure
 from executor.report.run_data import read_run
 from executor.run_result import RunResult
 from model.errors import BadInput, Fault
@@ -302,6 +303,15 @@ def test_checksums_of_further_files_are_ignored(filmed: RunFolder, tmp_path: Pat
     sums.write_text(sums.read_text() + "report.html\n")
     with pytest.raises(BadInput, match="not a checksum"):
         cdpr.load_run(folder.path)
+
+
+def test_a_summary_without_a_measured_clearance_has_none(blind: RunFolder) -> None:
+    edited = {**blind.summary()["clearance_mm"], "measured_min": None}
+    result = RunResult(blind.path, {**blind.summary(), "clearance_mm": edited})
+    assert np.isnan([result.smallest_clearance, *result.clearance_interval]).all()
+    assert "not measured" in result._repr_html_()
+    run = replace(read_run(blind), summary=result.summary)
+    assert "No clearance was measured." in clearance_figure(run)
 
 
 def test_a_clearance_made_again_is_that_of_the_encoders(blind: RunFolder, tmp_path: Path) -> None:
