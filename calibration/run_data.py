@@ -40,7 +40,8 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
     """
     run = RunFolder.open(folder)
     cycles, alone = run.cycles(), run.poses_by_camera()
-    names = [one["name"] for one in run.summary().get("cameras", [])]
+    used = [one["name"] for one in run.summary().get("cameras", [])]
+    names = [name for name in used if name in alone or not alone]
     if camera not in names:
         raise BadInput(
             f"camera {camera!r} took no images in this run",

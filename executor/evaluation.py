@@ -25,6 +25,7 @@ from executor.recording.mcap import write_mcap
 from executor.recording.record_files import AGAIN, RunCourse
 from executor.recording.recorder import Recorder
 from executor.recording.run_folder import (
+    BEGUN,
     CLEARANCE,
     COURSE,
     CYCLES,
@@ -138,9 +139,10 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     events = folder.events()
     if not course.final_state:
         course = _ended_by_events(course, cycles, events)
-    lost = course.cycles - len(cycles)
+    if len(cycles) == course.cycles - 1 and not folder.has(CYCLES):
+        cycles = folder.cycles()  # which refuses a last row that is cut short
     troubles = list(course.troubles)
-    if lost > 0:
+    if (lost := course.cycles - len(cycles)) > 0:
         troubles.append(f"Of {course.cycles} cycles the last {lost} are not on record")
     if folder.has(CLEARANCE):
         clearance = folder.clearance()
@@ -272,16 +274,16 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
         together = fused_table(cycles, poses)
         write_mcap(folder, result.context, cycles, poses, clearance, together, result.alone)
 
-    return [
+    files: list[_File] = [
         (CYCLES, partial(folder.write_cycles, cycles)),
         *_pose_files(folder, poses, result.alone),
         (CLEARANCE, partial(folder.write_clearance, clearance)),
         (SUMMARY, partial(folder.write_summary, result.summary)),
         (FUSED, lambda: folder.write_fused(fused_table(cycles, poses))),
         (MCAP, write_channels),
-        (CHECKSUMS, partial(write_checksums, folder.path)),
-        (REPORT, partial(build_report, folder)),
     ]
+    sums = partial(write_checksums, folder.path, [*BEGUN, *dict(files)])
+    return [*files, (CHECKSUMS, sums), (REPORT, partial(build_report, folder))]
 
 
 def _pose_files(folder: RunFolder, poses: PoseTable, alone: Mapping[str, PoseTable]) -> list[_File]:

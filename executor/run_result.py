@@ -129,15 +129,21 @@ class RunResult:
         return ClearanceTable.read_columns(self.folder / CLEARANCE)
 
     @property
+    def _measured(self) -> dict[str, Any] | None:
+        """The smallest measured clearance; None if none was measured."""
+        known: dict[str, Any] | None = self.summary.get("clearance_mm")
+        return None if known is None or known["measured_min"] is None else known
+
+    @property
     def smallest_clearance(self) -> float:
         """The smallest measured clearance, [m]; NaN if none was measured."""
-        known = self.summary.get("clearance_mm")
+        known = self._measured
         return float("nan") if known is None else float(known["measured_min"]) / 1e3
 
     @property
     def clearance_interval(self) -> tuple[float, float]:
         """95 % interval of the true clearance where the smallest was measured, [m]; else NaN."""
-        known = self.summary.get("clearance_mm")
+        known = self._measured
         if known is None:
             return float("nan"), float("nan")
         low = known["measured_min"] - known["measured_uncertainty"]
@@ -161,7 +167,7 @@ class RunResult:
             ("verdict", self.verdict),
             ("why", self.sentence),
             ("folder", str(self.folder)),
-            ("clearance", least if self.summary.get("clearance_mm") else "not measured"),
+            ("clearance", least if self._measured else "not measured"),
         ]
         return html_table(f"Run {self.folder.name}", rows)
 

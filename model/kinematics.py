@@ -248,6 +248,20 @@ def poses_near(
     return positions, rotations, np.max(np.abs(residuals), axis=1)
 
 
+def interpolate_quaternions(starts: Array, ends: Array, fractions: Array) -> Array:
+    """Unit quaternions (w, x, y, z) between n pairs of nearby ones, shape (n, 4).
+
+    Args:
+        starts: At fraction 0, which are returned as they are, shape (n, 4).
+        ends: At fraction 1, shape (n, 4).
+        fractions: Between 0 and 1, shape (n,).
+    """
+    signs = np.where((starts * ends).sum(axis=1) < 0.0, -1.0, 1.0)  # of the shorter rotation
+    mixed = starts + fractions[:, None] * (signs[:, None] * ends - starts)
+    mixed /= np.linalg.norm(mixed, axis=1, keepdims=True)
+    return np.where(fractions[:, None] > 0.0, mixed, starts)
+
+
 def _cold_starts(rig: Rig) -> list[Pose]:
     """Home, the workspace centre, and the centres of its octants."""
     centre = (rig.workspace_lower + rig.workspace_upper) / 2.0

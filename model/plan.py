@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from model.errors import BadInput, InvalidFile, path_of
-from model.files.documents import check_version, document_hash, problems_of, write_atomic
+from model.files.documents import check_version, document_hash, write_atomic
 from model.files.plan_file import (
     OptimalPlannerDocument,
     PlanDocument,
@@ -21,6 +21,7 @@ from model.files.plan_file import (
     QualityDocument,
 )
 from model.files.reading import read_json
+from model.files.validation import problems_of
 from model.pages.page import html_table
 from model.pose import Pose, largest_rotations
 from model.rig import NOT_IN_PLAN_HASH, Rig, rig_from_document

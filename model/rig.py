@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 
 from model.cameras import Camera, Tag, camera_from, left_out_errors, tag_from
 from model.errors import BadInput, path_of, require_types
-from model.files.documents import document_hash, document_of, key_path, load_yaml, millimetres
+from model.files.documents import document_hash, document_of, load_yaml, millimetres
 from model.files.rig_file import BusDocument, MotionDocument, RigDocument, WinchDocument
+from model.files.validation import key_path
 from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, floats_of, read_only
 from model.posed_rig import PosedRig, posed_rig
@@ -379,8 +380,7 @@ def rig_from_document(document: RigDocument) -> Rig:
     Raises:
         BadInput: Parts of the document do not agree.
     """
-    findings = [f"{key_path(parts)}: {what}" for parts, what in document.findings()]
-    if findings:
+    if findings := [f"{key_path(parts)}: {what}" for parts, what in document.findings()]:
         raise BadInput("; ".join(findings), where=f"rig {document.name}")
     pulleys, tags = document.pulleys, document.tags
     count = len(document.outlets_mm)

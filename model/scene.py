@@ -18,7 +18,6 @@ from model.files.documents import (
     PoseDocument,
     document_hash,
     document_of,
-    key_path,
     load_yaml,
     millimetres,
 )
@@ -36,6 +35,7 @@ from model.files.scene_file import (
     StopDocument,
     payloads,
 )
+from model.files.validation import key_path
 from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, RotationLimits, read_only
 from model.shapes import (

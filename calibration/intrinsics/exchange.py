@@ -25,7 +25,8 @@ from calibration.intrinsics.result import camera_named, with_camera
 from model.cameras import camera_from, is_camera_matrix, left_out_errors, principal_point_doubt
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, CameraDocument
-from model.files.documents import read_text, read_yaml, write_atomic
+from model.files.documents import read_yaml, write_atomic
+from model.files.reading import read_text
 from model.files.validation import parse_yaml
 from model.pose import Array, rotation_vector_from_matrix
 from model.progress import SILENT, Listener

@@ -318,7 +318,7 @@ class FaultLatch:
 
     def _write(self, latched: LatchedFault) -> None:
         try:
-            write_atomic(self.path, json.dumps(asdict(latched), indent=1) + "\n")
+            write_atomic(self.path, json.dumps(asdict(latched), indent=1) + "\n", durable=True)
         except CdprError as error:
             raise self._not_kept(error.why) from None
 

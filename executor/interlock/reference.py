@@ -237,7 +237,7 @@ class ReferenceFile:
         try:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             text = json.dumps(reference.model_dump(mode="json"), indent=1) + "\n"
-            write_atomic(path, text)
+            write_atomic(path, text, durable=True)
             for other in earlier:
                 other.unlink(missing_ok=True)
         except (OSError, CdprError) as error:

@@ -3,13 +3,14 @@
 Written when a run ends, and compared whenever its folder is opened: a file that was edited, damaged
 or mixed up with that of another run is named. It proves nothing against one who also rewrites the
 checksums. Images and the report are left out; a killed run has none. A file that is missing counts
-as changed, unless `cdpr report` makes it again (`REBUILT`).
+as changed, unless `cdpr report` makes it again (`REBUILT`). Lines of other files are ignored.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 from executor.recording.record_files import AGAIN
@@ -28,14 +29,14 @@ _RECORD = re.compile(
 REBUILT = frozenset({"summary.json", "clearance.csv", "fused.csv", "run.mcap"})
 
 
-def write_checksums(folder: Path) -> None:
-    """Writes the checksums of all files of a run that exist.
+def write_checksums(folder: Path, names: Iterable[str]) -> None:
+    """Writes the checksums of the files of these names that exist.
 
     Raises:
         BadInput: A file cannot be read, or the folder cannot be written to.
     """
-    names = sorted(path.name for path in folder.iterdir() if _RECORD.fullmatch(path.name))
-    lines = [f"{_checksum(folder / name)}  {name}\n" for name in names]
+    found = sorted(name for name in names if (folder / name).is_file())
+    lines = [f"{_checksum(folder / name)}  {name}\n" for name in found]
     write_atomic(folder / CHECKSUMS, "".join(lines))
 
 
@@ -51,8 +52,10 @@ def require_unchanged(folder: Path) -> None:
     changed = []
     for number, line in enumerate(read_text(path, MEGABYTE).splitlines(), start=1):
         found = _LINE.fullmatch(line)
-        if found is None or not _RECORD.fullmatch(found[2]):
+        if found is None:
             raise BadInput("not a checksum", where=f"{path}:{number}", next_step=AGAIN)
+        if not _RECORD.fullmatch(found[2]):
+            continue
         if not (folder / found[2]).is_file():
             changed += [f"{found[2]} (missing)"] if found[2] not in REBUILT else []
         elif _checksum(folder / found[2]) != found[1]:

@@ -246,7 +246,7 @@ def scene_at(
 
 def frame_of(camera: str) -> str:
     """The frame of one of several cameras, or of the only one."""
-    return camera or "camera"
+    return f"camera/{camera}" if camera in (WORLD, PLATFORM) else camera or "camera"
 
 
 def robot_messages(rig: Rig, cycles: CycleTable, start: int) -> Iterator[Message]:

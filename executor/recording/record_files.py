@@ -25,7 +25,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from model.errors import BadInput, InvalidFile
-from model.files.documents import keep_names, write_atomic
+from model.files.documents import write_atomic
+from model.files.output import keep_names
 from model.files.reading import TABLE_LIMIT, parse_json, read_bytes, read_json, read_text
 from model.files.validation import problems_of
 
@@ -254,8 +255,7 @@ def read_events(path: Path, lines: Sequence[str]) -> list[EventRecord]:
         try:
             events.append(EventRecord.model_validate(parse_json(line)))
         except ValueError:
-            what = "not an event"
-            raise BadInput(what, where=f"{path}:{number}", next_step=AGAIN) from None
+            raise BadInput("not an event", where=f"{path}:{number}", next_step=AGAIN) from None
     return events
 
 

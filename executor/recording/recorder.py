@@ -7,7 +7,6 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,7 +21,7 @@ from executor.trajectory.dwell import legs_at, stop_events
 from executor.trajectory.setpoints import CheckedTrajectory, PreparedRun
 from model.errors import BadInput, CdprError, Fault
 from model.files.reading import MEGABYTE, READING_NEEDS, TABLE_LIMIT
-from model.kinematics import forward_kinematics, poses_near
+from model.kinematics import forward_kinematics, interpolate_quaternions, poses_near
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
@@ -133,7 +132,9 @@ class RunLog:
         cycles = self._cycles(first, self._count if end is None else end)
         began = self._chunks[0]["at"][0] if len(cycles) else 0.0
         index = self._reported_index(cycles, first)
-        rows = np.rint(index).astype(np.int64)
+        rows, low = np.rint(index).astype(np.int64), np.floor(index).astype(np.int64)
+        high = np.minimum(low + 1, len(planned) - 1)
+        starts, ends = (quaternions_of(planned.rotations[each]) for each in (low, high))
         lengths, tensions, most_off = self._lengths(cycles, rows)
         encoder, rotations, off = poses_near(
             rig, lengths, planned.positions[rows], planned.rotations[rows]
@@ -152,7 +153,7 @@ class RunLog:
             rejected=cycles["rejected"].astype(np.int64),
             error_frames=cycles["error_frames"].astype(np.int64),
             planned=between(planned.positions, index),
-            planned_rotation=quaternions_of(planned.rotations[rows]),
+            planned_rotation=interpolate_quaternions(starts, ends, index - low),
             encoder=np.where(fits[:, None], encoder, np.nan),
             encoder_rotation=np.where(fits[:, None], quaternions_of(rotations), np.nan),
             following_error=cycles["following_error"].copy(),
@@ -248,12 +249,7 @@ class RecordWriter:
         """Returns itself."""
         return self
 
-    def __exit__(
-        self,
-        _kind: type[BaseException] | None,
-        _error: BaseException | None,
-        _trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """See `close`."""
         self.close()
 

@@ -30,10 +30,11 @@ from executor.recording.record_files import (
 )
 from executor.recording.tables import CycleTable, FusedTable, PoseTable
 from model.errors import BadInput, Fault, InvalidFile
-from model.files.documents import problems_of, write_atomic
+from model.files.documents import write_atomic
 from model.files.plan_file import PlanDocument
 from model.files.reading import PICTURE_LIMIT, read_bytes, read_json
 from model.files.rig_file import RigDocument
+from model.files.validation import problems_of
 from model.plan import Plan, load_plan, save_plan
 from model.rig import Rig, rig_from_document
 
@@ -164,10 +165,10 @@ class RunFolder:
         return BadInput(what, where=str(self.path), why=why, next_step=then)
 
     def has(self, name: str) -> bool:
-        """Whether a file exists and ends with a complete line."""
+        """Whether a file exists, not empty, and ends with a whole line if it can be made again."""
         with suppress(OSError), (self.path / name).open("rb") as stream:
             stream.seek(-1, os.SEEK_END)
-            return stream.read() == b"\n"
+            return stream.read() == b"\n" or name not in (CYCLES, *REBUILT - {SUMMARY})
         return False
 
     @property
@@ -313,10 +314,9 @@ class RunFolder:
 
     def poses_by_camera(self) -> dict[str, PoseTable]:
         """Reads the poses of each of several cameras; empty for a single camera."""
-        begin, end = POSES_OF.split("{}")
-        files = sorted(self.path.glob(POSES_OF.format("*")))
-        names = [file.name.removeprefix(begin).removesuffix(end) for file in files]
-        return dict(zip(names, map(PoseTable.read_csv, files), strict=True))
+        names = sorted(one.name for one in self.course().cameras or self.rig().cameras)
+        files = {name: self.path / POSES_OF.format(name) for name in names if len(names) > 1}
+        return {name: PoseTable.read_csv(file) for name, file in files.items() if file.is_file()}
 
     def write_clearance(self, table: ClearanceTable) -> None:
         """Writes ``clearance.csv``."""

@@ -176,7 +176,7 @@ def _required(run: RunData) -> ChartLine:
 
 def _clearance_text(run: RunData) -> str:
     key = run.summary["clearance_mm"]
-    if key is None:
+    if key is None or key["measured_min"] is None:
         return "No clearance was measured."
     return (
         f"Line chart of the smallest clearance over time. Planned at least {key['planned_min']:.1f}"

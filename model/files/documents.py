@@ -24,6 +24,7 @@ from pydantic import (
 )
 
 from model.errors import BadInput, InvalidFile, Problem
+from model.files.output import keep_names
 from model.files.reading import YAML_LIMIT, read_text
 from model.files.validation import (
     KeyPath,
@@ -128,6 +129,21 @@ def _has_length_one(vector: list[float]) -> list[float]:
 
 UnitVector = Annotated[Vector, AfterValidator(_has_length_one)]
 
+
+def _holds_whole(annotation: Any) -> bool:
+    """Whether a key holds whole numbers, alone, in lists or optionally."""
+    is_whole = annotation is int or type(annotation) is int  # one of a `Literal`
+    return is_whole or any(map(_holds_whole, getattr(annotation, "__args__", ())))
+
+
+def _whole(value: Any) -> Any:
+    """A float that is a whole number as such, also in lists; not one with rounded digits."""
+    if isinstance(value, list):
+        return [_whole(entry) for entry in value]
+    is_whole = isinstance(value, float) and value.is_integer() and abs(value) <= 2**53
+    return int(value) if is_whole else value
+
+
 Finding = tuple[tuple[str | int, ...], str]
 """Path of a key, and a sentence that states its problem."""
 
@@ -139,6 +155,15 @@ class Document(BaseModel):
     """
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _take_whole_numbers(cls, data: Any) -> Any:
+        """Takes 1e6 and 1000000.0 for whole numbers."""
+        if not isinstance(data, dict):
+            return data
+        keys = [key for key, field in cls.model_fields.items() if _holds_whole(field.annotation)]
+        return data | {key: _whole(data[key]) for key in keys if key in data}
 
     @model_validator(mode="after")
     def _fix_lists(self) -> Self:
@@ -193,20 +218,6 @@ def millimetres(values: Sequence[float] | Sequence[Sequence[float]]) -> Array:
     """Numbers in mm as an array of the same shape in m."""
     return np.asarray(values, dtype=np.float64) / 1000.0
 
-
-__all__ = [
-    "check_version",
-    "content_hash",
-    "document_hash",
-    "keep_names",
-    "key_path",
-    "load_yaml",
-    "problems_of",
-    "read_text",
-    "read_yaml",
-    "write_atomic",
-    "write_bytes_atomic",
-]
 
 Model = TypeVar("Model", bound=Document)
 
@@ -385,17 +396,18 @@ def document_hash(document: BaseModel, without: Collection[str] = ()) -> str:
     return content_hash({key: value for key, value in content.items() if key not in without})
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """Writes a whole text file or nothing.
-
-    Raises:
-        BadInput: The folder is missing, cannot be written to or is full.
-    """
-    write_bytes_atomic(path, text.encode(errors="backslashreplace"))
+def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
+    """As `write_bytes_atomic`, for text."""
+    write_bytes_atomic(path, text.encode(errors="backslashreplace"), durable=durable)
 
 
-def write_bytes_atomic(path: Path, data: bytes) -> None:
+def write_bytes_atomic(path: Path, data: bytes, *, durable: bool = False) -> None:
     """Writes a whole file or nothing.
+
+    Args:
+        path: The file.
+        data: Its content.
+        durable: As for `keep_names`.
 
     Raises:
         BadInput: The folder is missing, cannot be written to or is full.
@@ -415,26 +427,16 @@ def write_bytes_atomic(path: Path, data: bytes) -> None:
             stream.write(data)
             stream.flush()
             os.fsync(handle)  # or a power failure could leave the new name on an empty file
-        Path(temporary).chmod(0o644)
+        with suppress(PermissionError):  # a mount that gives all files one owner and mode
+            Path(temporary).chmod(0o644)
+        if durable:
+            keep_names(path.parent, durable=True)  # refuses before anything is replaced
         Path(temporary).replace(path)
         keep_names(path.parent)
     except OSError as error:
         raise _not_written(path, error, "free some space or choose another folder") from None
     finally:
         Path(temporary).unlink(missing_ok=True)  # already renamed on success
-
-
-def keep_names(folder: Path) -> None:
-    """Syncs a folder to disk, so that new file names survive a power failure.
-
-    Raises:
-        OSError: The folder is gone, or the disk fails.
-    """
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def _not_written(path: Path, error: OSError, next_step: str) -> BadInput:

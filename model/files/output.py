@@ -1,7 +1,8 @@
-"""Output paths, checked before the work: a result that cannot be written would be lost."""
+"""Output paths, checked before the work as a result would be lost, and folders synced after it."""
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from collections.abc import Iterable, Iterator, Mapping
@@ -152,3 +153,26 @@ def _identities(path: Path) -> Iterator[Identity]:
             if not entry.is_dir():
                 with suppress(BadInput):  # a dangling link
                     yield file_identity(Path(entry.path))
+
+
+def keep_names(folder: Path, *, durable: bool = False) -> None:
+    """Syncs a folder to disk, so that new file names survive a power failure.
+
+    Args:
+        folder: The folder.
+        durable: Refuse a file system that cannot do this, such as a VirtualBox shared folder.
+
+    Raises:
+        OSError: The folder is gone, the disk fails, or as above.
+    """
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+        if durable:
+            why = "its file system cannot sync folders, and may lose the file in a power failure"
+            raise OSError(error.errno, why) from None
+    finally:
+        os.close(handle)

@@ -61,8 +61,13 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     folder = RunFolder.create(path)
     folder.write_plan(run.context.plan.document)
     folder.write_rig(run.context.rig.document)
-    started, cycles = run.context.course.started, len(run.cycles)
-    folder.write_course(RunCourse(started, "virtual", True, True, "finished", "", cycles))
+    course = run.context.course
+    folder.write_course(
+        RunCourse(
+            *(course.started, "virtual", True, True, "finished", "", len(run.cycles)),
+            cameras=course.cameras,
+        )
+    )
     poses = run.poses
     if pictures:
         rows = set(range(0, len(poses), 20))

@@ -243,7 +243,7 @@ def fails(*_: object, **__: object) -> None:
     raise OSError(errno.EROFS, os.strerror(errno.EROFS))
 
 
-def cannot_be_kept(*_: object) -> None:
+def cannot_be_kept(*_: object, **__: object) -> None:
     raise BadInput("the file cannot be written", where="somewhere", why="Read-only file system")
 
 
@@ -256,6 +256,23 @@ def test_nothing_moves_when_the_latch_cannot_be_written(
         mine.engage("a rig", folder)
     assert mine.read() is None
     assert not other.held_by_another(), "a refusal holds nothing"
+
+
+def test_nothing_moves_where_a_power_failure_may_lose_the_latch(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mine, _ = two()
+    fsync = os.fsync
+
+    def of_files(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", of_files)
+    with pytest.raises(Refused, match="file system cannot sync folders"):
+        mine.engage("a rig", folder)
+    assert mine.read() is None
 
 
 def test_nothing_moves_when_the_lock_or_its_folder_cannot_be_made(

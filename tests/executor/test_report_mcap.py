@@ -137,13 +137,13 @@ def test_the_camera_is_in_the_tree_of_frames_with_its_lens(
     ] == camera.world_from_camera.position.tolist()
 
 
-@pytest.mark.parametrize("used", [("right",), ("left", "right")])
+@pytest.mark.parametrize("used", [("right",), ("left", "right"), ("platform", "world")])
 def test_cameras_that_were_not_used_name_nothing(
     run: fake_run.FakeRun, tmp_path: Path, used: tuple[str, ...]
 ) -> None:
     """Images, frames and calibrations belong together, also of one of a rig's cameras."""
     (camera,) = run.context.rig.cameras
-    cameras = tuple(replace(camera, name=name) for name in ("left", "right", "spare"))
+    cameras = tuple(replace(camera, name=name) for name in (*used, "spare"))
     context = fake_run.changed(
         run.context,
         rig=replace(run.context.rig, cameras=cameras),
@@ -157,6 +157,7 @@ def test_cameras_that_were_not_used_name_nothing(
     of_images = {topic: rows[0][1].frame_id for topic, rows in found.items() if "pict" in topic}
     of_lenses = {topic: rows[0][1].frame_id for topic, rows in found.items() if "calib" in topic}
     frames = {m.transforms[0].child_frame_id for _, m in found["/tf"]} - {"platform"}
+    assert "world" not in frames
     assert frames == set(of_images.values()) == set(of_lenses.values())
     assert of_lenses == {
         topic.replace("/pictures", "/camera_calibration"): name for topic, name in of_images.items()

@@ -8,6 +8,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,13 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 
 import cdpr
+from calibration.run_data import poses_of_run
 from executor.evaluation import evaluate_folder, rewrite_report, write_end
 from executor.recording.clearance import ClearanceTable
+from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunFolder
+from executor.report.figures import clearance_figure
+from executor.report.run_data import read_run
 from executor.run_result import RunResult
 from model.errors import BadInput, Fault
 from tests.cli.program import call, one_message
@@ -223,6 +228,90 @@ def test_what_is_made_from_the_record_is_made_again_with_the_same_verdict(
     if "summary.json" not in lost:
         assert folder.summary() == blind.summary()
     assert call("report", folder.path).code == 0
+
+
+@pytest.mark.parametrize("used", [("front",), ("front", "side")])
+def test_files_named_like_poses_of_a_camera_do_no_harm(
+    tmp_path: Path, used: tuple[str, ...]
+) -> None:
+    """Such as the log of `cdpr track` of the images of the run, or a backup of its poses."""
+    run = fake_run.make(rate_hz=2.0, every=20)
+    cameras = tuple(CameraRecord(name, "0", 9, 9, 0, 2.0, "") for name in used)
+    context = fake_run.changed(run.context, cameras=cameras)
+    folder = fake_run.write(replace(run, context=context), tmp_path / "run")
+    alone = dict.fromkeys(used, folder.poses()) if len(used) > 1 else {}
+    for name, table in alone.items():
+        folder.write_poses_of(name, table)
+    (folder.path / "poses-tracked.csv").write_text("picture,x_mm\na.jpg,1\n")
+    shutil.copy(folder.path / "poses.csv", folder.path / "poses-backup.csv")
+    rewrite_report(RunFolder.open_cut_short(folder.path))
+    assert read_run(folder).alone.keys() == alone.keys()
+    assert len(poses_of_run(folder.path, "front")) > 1
+    sums = (folder.path / "SHA256SUMS").read_text()
+    assert re.findall(r"poses-(\w+)", sums) == [*alone]
+    (folder.path / "poses-backup.csv").unlink()
+    assert cdpr.load_run(folder.path).passed
+
+
+def test_poses_of_a_camera_that_are_missing_are_named(tmp_path: Path) -> None:
+    run = fake_run.make(rate_hz=2.0, every=20)
+    cameras = tuple(CameraRecord(name, "0", 9, 9, 0, 2.0, "") for name in ("front", "side"))
+    context = fake_run.changed(run.context, cameras=cameras)
+    folder = fake_run.write(replace(run, context=context), tmp_path / "run")
+    folder.write_poses_of("side", folder.poses())
+    with pytest.raises(BadInput, match="camera 'front' took no images"):
+        poses_of_run(folder.path, "front")
+
+
+def test_poses_without_a_final_newline_are_read_and_stay(filmed: RunFolder, tmp_path: Path) -> None:
+    """As a spreadsheet may save them; nothing replaces them."""
+    folder = without(filmed, tmp_path / "run", "SHA256SUMS", "run.mcap")
+    poses, summary = folder.path / "poses.csv", folder.path / "summary.json"
+    for path in (poses, summary):
+        path.write_bytes(path.read_bytes().rstrip(b"\n"))
+    before = poses.read_bytes(), summary.read_bytes()
+    rewrite_report(RunFolder.open_cut_short(folder.path))
+    assert (poses.read_bytes(), summary.read_bytes()) == before
+    assert images_in_mcap(folder.mcap) == images_in_mcap(filmed.mcap)
+    poses.write_bytes(before[0][: before[0].rfind(b"\n") + 20])
+    for name in ("SHA256SUMS", "run.mcap"):
+        (folder.path / name).unlink()
+    with pytest.raises(BadInput, match=r"line \d+ has 4 values"):
+        rewrite_report(RunFolder.open_cut_short(folder.path))
+
+
+def test_a_last_cycle_without_a_newline_counts_if_it_is_whole(
+    blind: RunFolder, tmp_path: Path
+) -> None:
+    folder = without(blind, tmp_path / "run", "SHA256SUMS", "run.mcap", "summary.json")
+    path = folder.path / "cycles.csv"
+    whole = path.read_bytes()
+    path.write_bytes(whole.rstrip(b"\n"))
+    assert evaluate_folder(folder).summary["verdict"] == "PASSED"
+    path.write_bytes(whole[: whole.rstrip(b"\n").rfind(b"\n") + 20])
+    with pytest.raises(BadInput, match=r"line \d+ has 3 values"):
+        evaluate_folder(folder)
+
+
+def test_checksums_of_further_files_are_ignored(filmed: RunFolder, tmp_path: Path) -> None:
+    """As `sha256sum * pictures/* > SHA256SUMS` lists them for an archive."""
+    folder = without(filmed, tmp_path / "run")
+    sums = folder.path / "SHA256SUMS"
+    others = "".join(f"{'0' * 64}  {name}\n" for name in ("report.html", "pictures/a.jpg", "a b"))
+    sums.write_text(sums.read_text() + others)
+    assert cdpr.load_run(folder.path).passed
+    sums.write_text(sums.read_text() + "report.html\n")
+    with pytest.raises(BadInput, match="not a checksum"):
+        cdpr.load_run(folder.path)
+
+
+def test_a_summary_without_a_measured_clearance_has_none(blind: RunFolder) -> None:
+    edited = {**blind.summary()["clearance_mm"], "measured_min": None}
+    result = RunResult(blind.path, {**blind.summary(), "clearance_mm": edited})
+    assert np.isnan([result.smallest_clearance, *result.clearance_interval]).all()
+    assert "not measured" in result._repr_html_()
+    run = replace(read_run(blind), summary=result.summary)
+    assert "No clearance was measured." in clearance_figure(run)
 
 
 def test_a_clearance_made_again_is_that_of_the_encoders(blind: RunFolder, tmp_path: Path) -> None:

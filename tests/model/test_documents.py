@@ -7,7 +7,9 @@ import hashlib
 import os
 import pickle
 import re
+import stat
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -15,6 +17,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from executor.recording.record_files import append_lines
 from model.errors import BadInput, without_passwords
 from model.files.documents import content_hash, write_atomic
 
@@ -92,6 +95,48 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(
     assert caught.value.why == os.strerror(number)
     assert path.read_text() == "old"
     assert [p.name for p in tmp_path.iterdir()] == ["file.json"]
+
+
+def syncing_no_folder(number: int) -> Callable[[int], None]:
+    """A file system whose folders cannot be synced."""
+    fsync = os.fsync
+
+    def of_files(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(number, os.strerror(number))
+        fsync(handle)
+
+    return of_files
+
+
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOTSUP])
+def test_a_file_system_without_modes_and_synced_folders_takes_files(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As mounts of a network drive or of a virtual machine's host may be."""
+
+    def denied(*_: object) -> NoReturn:
+        raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+    monkeypatch.setattr(os, "fsync", syncing_no_folder(number))
+    monkeypatch.setattr(Path, "chmod", denied)
+    write_atomic(tmp_path / "file.json", "new")
+    append_lines(tmp_path / "lines.csv", "a\n", fsync=True)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["file.json", "lines.csv"]
+    with pytest.raises(BadInput, match="file system cannot sync folders"):
+        write_atomic(tmp_path / "file.json", "newer", durable=True)
+    assert (tmp_path / "file.json").read_text() == "new"
+
+
+@pytest.mark.parametrize("number", [errno.EIO, errno.ENOSPC])
+def test_a_folder_that_the_disk_fails_to_sync_is_reported(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", syncing_no_folder(number))
+    with pytest.raises(BadInput, match="cannot be written"):
+        write_atomic(tmp_path / "file.json", "new")
+    with pytest.raises(OSError, match=os.strerror(number)):
+        append_lines(tmp_path / "lines.csv", "a\n", fsync=True)
 
 
 def test_an_interrupted_write_leaves_no_temporary_file(

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.errors import BadInput, CdprError, InvalidFile
-from model.files.documents import key_path
 from model.files.rig_file import RigDocument
+from model.files.validation import key_path
 from model.rig import load_rig, rig_from_document
 from tests.model.rig_builds import CONFIGS, hall_data, paper_data, rig_of
 
@@ -148,6 +148,41 @@ def test_two_cameras_of_one_name_are_reported(tmp_path: Path) -> None:
     start = PAPER.index("  - name: front")
     [(_, _, key, what)] = problems_in(PAPER + PAPER[start:], tmp_path)
     assert (key, what) == ("cameras[1].name", "camera name 'front' appears twice")
+
+
+@pytest.mark.parametrize(
+    ("line", "written"),
+    [
+        ("bitrate: 1000000", "bitrate: 1e6"),
+        ("node_id: 8,", "node_id: 8.0,"),
+        ("id: 301,", "id: 3.01e2,"),
+    ],
+)
+def test_a_whole_number_may_have_a_point_or_an_exponent(
+    line: str, written: str, tmp_path: Path
+) -> None:
+    text = PAPER if line in PAPER else PAPER.replace("bus:", f"bus:\n  {line}", 1)
+    path = tmp_path / "rig.yaml"
+    path.write_text(text)
+    plain = load_rig(path)
+    path.write_text(text.replace(line, written, 1))
+    assert path.read_text() != text
+    assert load_rig(path).hash == plain.hash
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("counts_per_rev: 1e17", "must be a whole number (it is 1e+17)"),
+        ("counts_per_rev: 0.5", "must be a whole number (it is 0.5)"),
+        ("counts_per_rev: .inf", "must be a whole number (it is inf)"),
+    ],
+)
+def test_other_numbers_are_no_whole_ones(line: str, sentence: str, tmp_path: Path) -> None:
+    whole = re.search(r"counts_per_rev: \d+", PAPER)
+    assert whole is not None
+    found = problems_in(PAPER.replace(whole[0], line, 1), tmp_path)
+    assert {what for _, _, _, what in found} == {sentence}
 
 
 def test_five_cables_are_too_few(tmp_path: Path) -> None:

@@ -94,9 +94,9 @@ def problems_with(obstacles: list[dict[str, Any]], tmp_path: Path) -> list[tuple
             "needs 3 entries, it has 2",
         ),
         (
-            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1, 2.0]]}},
+            {"mesh": {"points_mm": TETRAHEDRON, "triangles": [[0, 1, 2.5]]}},
             "obstacles[0].mesh.triangles[0][2]",
-            "must be a whole number (it is 2.0)",
+            "must be a whole number (it is 2.5)",
         ),
     ],
 )

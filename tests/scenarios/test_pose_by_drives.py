@@ -10,10 +10,10 @@ import numpy as np
 from executor.cameras.multi_camera import CameraRecords
 from executor.evaluation import _clearance
 from executor.recording.recorder import RunLog
-from executor.state_machine import State
+from executor.state_machine import CycleRecord, State
 from executor.trajectory.setpoints import PreparedRun
 from model.kinematics import cable_lengths
-from model.pose import Pose
+from model.pose import Pose, interpolate, matrix_from_rotation_vector
 from model.winches import WinchMap
 from tests.scenarios.stage import staged
 
@@ -107,3 +107,35 @@ def test_positions_that_fit_no_pose_give_neither_a_pose_nor_a_clearance(
     assert scene.obstacles
     clearance = _clearance(prepared.rig, scene, cycles, CameraRecords())
     assert 0.0 < cycles.time[before - 1] - clearance.time.max() < 0.1
+
+
+def test_planned_orientation_is_that_of_the_fraction_of_a_row(prepared: PreparedRun) -> None:
+    """Below full speed the drives follow set-points between two rows, here 1 degree apart."""
+    table = prepared.checked.table
+    angles = np.radians(np.arange(len(table)))
+    turning = replace(
+        table, rotations=[matrix_from_rotation_vector([0.0, 0.0, angle]) for angle in angles]
+    )
+    log = RunLog(prepared.rig, prepared.scene, replace(prepared.checked, table=turning))
+    zeros = (0,) * prepared.rig.cable_count
+    last = len(table) - 1.0
+    indices = (35.0, 35.25, 35.5, 179.5, last, last)  # w is 0 at 180 degrees
+    for cycle, index in enumerate(indices):
+        counts = tuple(turning.setpoints[round(index)].tolist())
+        log.add(
+            CycleRecord(
+                cycle, 0.01 * cycle, State.MOVING, index, 1.0, counts, counts,
+                zeros, zeros, 0, 0, 0, 0.0, 0.0,
+            )
+        )  # fmt: skip
+    cycles, rows = log.table(), turning.poses()
+    reported = (0.0, *indices[:-1])  # CiA 402 drives report the set-point sent in the cycle before
+    assert cycles.path_index.tolist() == [round(index) for index in reported]
+    for k, index in enumerate(reported):
+        low = int(index)
+        expected = interpolate(rows[low], rows[min(low + 1, len(rows) - 1)], index - low)
+        planned = Pose.from_quaternion(cycles.planned[k], cycles.planned_rotation[k])
+        assert planned.angle_to(expected) < 1e-6
+        assert planned.distance_to(expected) < 1e-9
+        if index == low:
+            assert cycles.planned_rotation[k].tolist() == rows[low].quaternion.tolist()

@@ -22,7 +22,8 @@ def build(folder: Path) -> dict[str, list[Path]]:
     run = fake_run.write(fake_run.make(every=20), folder / "run").path
     _cut_short(run, folder / "cut")
     shutil.copytree(folder / "cut", folder / "checksums")
-    write_checksums(folder / "checksums")
+    sums = folder / "checksums"
+    write_checksums(sums, [path.name for path in sums.glob("*.*")])
     _endpoints(folder / "flat_endpoints.json")
     (folder / "poses.csv").write_text(
         "picture,x_mm,y_mm,z_mm,qw,qx,qy,qz\na.png,1,2,300,1,0,0,0\nb.png,4,5,300,1,0,0,0\n"
