@@ -106,6 +106,33 @@ def test_the_detectors_are_timed_as_they_are_scored(monkeypatch: pytest.MonkeyPa
     assert ("ours", image) in timed
 
 
+def test_a_path_counts_at_a_mark_only_if_it_was_known_by_then(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """OMPL's planners, which run beside ours, are read that way."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks" / "planner"))
+    import ours
+
+    for name in ("ours", "compiled_rrt", "result"):
+        monkeypatch.delitem(sys.modules, name)
+    rounds = iter([(0.4, 5.0), (1.5, 4.0), (30.0, 3.0)])
+    clock = SimpleNamespace(now=0.0)
+
+    def advance(_handle: object, _rounds: int) -> float:
+        clock.now, length = next(rounds)
+        return length
+
+    search = SimpleNamespace(points=np.zeros((9, 2, 3)), counts=np.zeros((9, 2), np.int64))
+    monkeypatch.setattr(ours, "time", SimpleNamespace(process_time=lambda: clock.now))
+    monkeypatch.setattr(ours, "advance", advance)
+    monkeypatch.setattr(ours, "handle_of", lambda *_: None)
+    monkeypatch.setattr(ours, "new_search", lambda *_: search)
+    monkeypatch.setattr(ours, "_checks", lambda _search: 0)
+    contestant: Any = object.__new__(ours.Contestant)
+    vars(contestant).update(_problem=None, _start=None, _goal=None, _first=lambda _seed: 0.3)
+    assert contestant.run(1, (0.2, 1.0, 10.0, 20.0)).lengths_m == (np.inf, 5.0, 4.0, 4.0)
+
+
 def test_the_scene_of_jogs_is_a_path_in_the_current_folder(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
