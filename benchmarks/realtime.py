@@ -6,9 +6,9 @@
 The real-time process is that of `cdpr run`, with all work of a cycle: requests, gate, set-points,
 simulated drives and platform in the same process, replies, monitor, status ring. It follows a path
 of the paper's third environment, which takes about 43 s; a longer time is refused. The plain loop
-runs at the same time in its own process: a thread sleeps with `time.sleep` until its next cycle,
-beside another that writes JSON fifty times a second, as a logging server does. Lateness is the
-delay of a cycle's start after its deadline.
+runs in its own process and counts during the motion: a thread sleeps with `time.sleep` until its
+next cycle, beside another that writes JSON fifty times a second, as a logging server does. Lateness
+is the delay of a cycle's start after its deadline.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -83,15 +84,41 @@ def with_cycle(rig: Rig, cycle_ms: float) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"bus": bus}))
 
 
-def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Array:
-    """Lateness of every cycle of a run that is stopped after a time, [ms]."""
+@dataclass(frozen=True)
+class Motion:
+    """A motion of the real-time process.
+
+    Attributes:
+        lateness: Of every cycle, [ms].
+        begin: When its drives were armed, by the monotonic clock, [s].
+        end: When its stop was requested, by the same clock, [s].
+        denied: The real-time rights that the system denied.
+    """
+
+    lateness: Array
+    begin: float
+    end: float
+    denied: str
+
+
+def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Motion:
+    """The motion of a run that is stopped after a time."""
     board = SharedRequests()
     run = RunFolder.create(folder)
     status = RunStatus(prepared, folder, board, simulated_time=False)
     cycle = prepared.checked.table.cycle
+    begin, end, denied = 0.0, math.inf, ""
+
+    def note_start(rights: str) -> None:
+        nonlocal begin, denied
+        begin, denied = time.monotonic(), rights
+        if denied:
+            print(f"({denied})")
 
     def watch_the_time(row: float) -> None:
+        nonlocal end
         if row * cycle >= seconds:
+            end = min(end, time.monotonic())
             board.ask_stop()
 
     recorder = Recorder(
@@ -112,16 +139,18 @@ def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Arr
         pose_every=0,
         check_drives=lambda _released: "",  # the drives end with their process
         need_real_time=False,
-        before_motion=lambda denied: print(f"({denied})") if denied else None,
+        before_motion=note_start,
     )
     print(f"    run ended: {outcome.state.value} {outcome.cause}")
-    lateness: Array = outcome.log.table().lateness * 1e3
-    return lateness
+    return Motion(outcome.log.table().lateness * 1e3, begin, end, denied)
 
 
 def plain_loop(cycle: float, link: Connection) -> None:
-    """The reference process: cycles by `time.sleep` in a thread until a message ends it."""
-    late: list[float] = []
+    """The reference process: cycles by `time.sleep` in a thread.
+
+    Begin and end of the motion, as a message, end it; the answer is the lateness in between, [ms].
+    """
+    late: list[tuple[float, float]] = []
     over = threading.Event()
 
     def cycles() -> None:
@@ -129,8 +158,8 @@ def plain_loop(cycle: float, link: Connection) -> None:
         while not over.is_set():
             deadline += cycle
             time.sleep(max(0.0, deadline - time.monotonic()))
-            late.append(time.monotonic() - deadline)
-            if late[-1] > cycle:  # as the real loop: a late cycle delays the next ones
+            late.append((deadline, time.monotonic() - deadline))
+            if late[-1][1] > cycle:  # as the real loop: a late cycle delays the next ones
                 deadline = time.monotonic()
 
     thread = threading.Thread(target=cycles)
@@ -138,9 +167,10 @@ def plain_loop(cycle: float, link: Connection) -> None:
     document = {"drives": [{"position": k * 0.1, "state": "enabled"} for k in range(3000)]}
     while not link.poll(0.02):
         json.dumps(document)
+    begin, end = link.recv()
     over.set()
     thread.join()
-    link.send(np.array(late) * 1e3)
+    link.send(np.array([delay for due, delay in late if begin <= due <= end]) * 1e3)
 
 
 def burn() -> None:
@@ -187,15 +217,16 @@ def measured(prepared: PreparedRun, busy: bool, seconds: float, folder: Path) ->
         plain.start()
         try:
             ours = process_lateness(prepared, folder / f"{rate:g}-{busy}", seconds)
-            link.send(None)
+            link.send((ours.begin, ours.end))
             theirs = link.recv()
         except BaseException:
             plain.kill()
             raise
         finally:
             plain.join()
+    loop = "real-time process, rights denied" if ours.denied else "real-time process"
     return [
-        row(rate, load, "real-time process", ours),
+        row(rate, load, loop, ours.lateness),
         row(rate, load, "thread with `time.sleep`", theirs),
     ]
 

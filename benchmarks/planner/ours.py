@@ -44,12 +44,13 @@ class Contestant:
         first = self._first(seed)
         search = new_search(self._start, self._goal, seed)
         handle, lengths = handle_of(self._problem, search), list[float]()
+        length = np.inf
         begin = time.process_time()
         while len(lengths) < len(marks_s):
-            length = advance(handle, 1)
+            known, length = length, float(advance(handle, 1))
             spent = time.process_time() - begin
             while len(lengths) < len(marks_s) and spent >= marks_s[len(lengths)]:
-                lengths.append(float(length))
+                lengths.append(known)
         path = search.points[BEST, : search.counts[BEST, 0]].copy()
         return Result(first, tuple(lengths), _checks(search), path)
 

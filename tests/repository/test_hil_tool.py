@@ -1,7 +1,8 @@
-"""`tools/hil/run.py` keeps the results of each part in a folder of its own."""
+"""`tools/hil` keeps the results of each part in a folder of its own, and names what it lacks."""
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -40,3 +41,16 @@ def test_a_run_deletes_the_results_of_its_own_part_only(
     assert tool.main() == tool.NO_BUS
     deleted = {part for part, figures in kept.items() if not figures.exists()}
     assert deleted == {"table" if "table" in arguments else "all"}
+
+
+@pytest.mark.parametrize("code", [0, 100])
+def test_a_distribution_without_debian_s_kernel_is_advised_to_load_the_module(
+    tool: Any, code: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """As on Ubuntu, whose apt ends with 100 for an unknown package."""
+    apt = tmp_path / "apt-cache"
+    apt.write_text(f"#!/bin/sh\nexit {code}\n")
+    apt.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    with pytest.raises(tool.VmFailed, match="sudo modprobe vcan"):
+        sys.modules["kernel"]._package_name()

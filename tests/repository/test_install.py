@@ -1,4 +1,4 @@
-"""The `Makefile` installs on the Python it is given, and continues what was interrupted."""
+"""Installations from the `Makefile`, and the newcomer's clone of `.ci/as-user`."""
 
 from __future__ import annotations
 
@@ -102,3 +102,16 @@ def test_pins_that_return_after_an_interrupted_installation_are_installed_again(
 
 def test_wheels_are_checked_where_the_python_has_no_pip(folder: Path) -> None:
     assert make("check-arm64", python(folder, "3.12.1"))
+
+
+@pytest.mark.root
+def test_root_runs_as_a_newcomer_what_lies_in_another_user_s_clone(tmp_path: Path) -> None:
+    """As in a container with the developer's folder mounted: git refuses a stranger's files."""
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci/as-user", tmp_path / ".ci")
+    for command in ("init", "add .", "-c user.name=a -c user.email=a@b commit -m first"):
+        subprocess.run(["git", "-C", tmp_path, *command.split()], check=True, capture_output=True)
+    subprocess.run(["chown", "-R", "65534:65534", tmp_path], check=True)
+    command = [tmp_path / ".ci/as-user", "git", "log", "--format=%s"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (0, "first\n"), done.stderr

@@ -57,6 +57,18 @@ def test_a_declared_dependency_has_a_lower_bound_and_a_pin_that_meets_it(
     assert requirement.specifier.contains(pin)
 
 
+FIRST_WITH_WHEELS = {"matplotlib": "3.9.2", "numpy": "2.1", "pyyaml": "6.0.2"}
+"""The first releases with wheels for every Python in the classifiers, where others are older."""
+
+
+@pytest.mark.parametrize("name", FIRST_WITH_WHEELS)
+def test_the_lowest_version_of_a_dependency_has_wheels_for_every_python(name: str) -> None:
+    """Elsewhere `make test-lowest`, and so `.ci/run`, ends in pip's error."""
+    command = [sys.executable, str(ROOT / "tools/lowest.py")]
+    lowest = pins_of(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    assert lowest[canonicalize_name(name)] >= Version(FIRST_WITH_WHEELS[name])
+
+
 def installed_pins() -> set[str]:
     """Every pinned package; those of the extras at the end of the file only where they are."""
     text = (ROOT / "constraints.txt").read_text()

@@ -13,7 +13,7 @@ import time
 from enum import Enum
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import typer.main
 
@@ -36,6 +36,21 @@ LONG = (
     "demo", "plan", "run", "sim", "bench", "workspace", "monitor", "home", "jog", "track",
     "calibrate", "check", "doctor", "console",
 )  # fmt: skip
+FILES = {
+    "rig": "rig",
+    "scene": "scene",
+    "plan": "plan",
+    "calibration": "result",
+    "results": "result",
+    "first": "result",
+    "second": "result",
+    "file": "camera",
+    "coordinates": "coordinates",
+    "poses": "poses",
+    "data": "places",
+    "eds": "eds",
+}
+"""Kind of valid file for each parameter."""
 VALUES = (
     "0",
     "1",
@@ -136,27 +151,19 @@ class VerbFuzzer:
         return chosen
 
     def _usual(self, param: Any, chance: random.Random) -> list[str]:
-        name = param.name or ""
-        files = {
-            "rig": "rig",
-            "scene": "scene",
-            "plan": "plan",
-            "calibration": "result",
-            "first": "result",
-            "second": "result",
-            "poses": "poses",
-            "data": "places",
-            "eds": "eds",
-        }
-        if name == "run" or name == "from_run":
+        name, kind = param.name or "", param.type_descriptor.annotation
+        if get_origin(kind) is list:
+            (kind,) = get_args(kind)
+        if name in ("run", "from_run"):
             return [str(self._corpus["run"][0].parent)]
-        if name in ("output", "mcap", "overlay"):
+        if name in ("output", "mcap", "overlay", "foxglove_layout"):
             return [f"out/{chance.choice(('a.json', 'a.csv', 'a', 'a.pdf', 'a.avi'))}"]
-        kind = param.type_descriptor.annotation
-        if name in files:
-            return [str(chance.choice(self._corpus[files[name]]))]
+        if name in FILES:
+            return [str(chance.choice(self._corpus[FILES[name]]))]
         if name in ("source", "folder", "live"):
             return ["pictures"]
+        if get_origin(kind) is Literal:
+            return [chance.choice(get_args(kind))]
         if isinstance(kind, type) and issubclass(kind, Enum):
             return [chance.choice([one.value for one in kind])]
         return [chance.choice(("1", "2", "5", "10")) for _ in range(max(1, param.nargs))]

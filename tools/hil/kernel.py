@@ -23,6 +23,10 @@ META_PACKAGE = "linux-image-amd64"
 MODULES = ("virtio_pci", "9pnet_virtio", "9p", "overlay", "can_raw", "vcan")
 BUSYBOX = Path("/bin/busybox")
 GUEST_INIT = Path(__file__).parent / "guest_init"
+_NEXT = (
+    "next: on Debian sudo apt-get update; elsewhere sudo modprobe vcan (Ubuntu has it in"
+    " linux-modules-extra-$(uname -r))"
+)
 _FOLDERS = ("bin", "dev", "modules", "proc", "sys", "shared", "upper", "new")
 
 
@@ -56,7 +60,7 @@ def _package_name() -> str:
     listed = _apt("apt-cache", "depends", META_PACKAGE)
     found = re.search(r"Depends: (linux-image-\S+)", listed)
     if found is None:
-        raise VmFailed(f"apt knows no {META_PACKAGE}; next: sudo apt-get update")
+        raise VmFailed(f"apt knows no {META_PACKAGE}; {_NEXT}")
     return found[1]
 
 
@@ -70,7 +74,7 @@ def _apt(*command: str, folder: Path | None = None) -> str:
         ) from error
     except subprocess.CalledProcessError as error:
         output = error.stderr.strip() or error.stdout.strip()
-        raise VmFailed(f"{' '.join(command)}: {output}; next: sudo apt-get update") from error
+        raise VmFailed(f"{' '.join(command)}: {output}; {_NEXT}") from error
     return done.stdout
 
 
