@@ -46,7 +46,7 @@ class Standstill(ABC):
         requests: Callable[[], OperatorRequests],
         on_cycle: Callable[[CycleRecord], None],
     ) -> None:
-        """Sends nothing yet; arguments as for `executor.control.loop.Loop`."""
+        """Sends nothing yet; ``requests`` and ``on_cycle`` as in `SupervisorCalls`."""
         self._rig, self._master, self._group = rig, master, master.group
         self._requests, self._on_cycle = requests, on_cycle
         self._silence = ReplyTimeout(rig)
