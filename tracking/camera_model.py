@@ -21,6 +21,8 @@ from model.rig import Camera
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
 _CONVERGED = 1e-3
 """Rays of OpenCV's iteration are refined if they miss their pixel by more, [px]."""
+_SIMPLE, _NEAR_AXIS = 5, 0.5
+"""OpenCV's iteration converges for up to this number of coefficients and these rays, [m]."""
 _NEWTON_STEPS, _LONGEST_STEP, _AT_ONCE = 30, 0.3, 100_000
 """For these rays: iterations, largest step, and rays per batch."""
 WIDEST = 1.5
@@ -59,6 +61,8 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
         return _fisheye_rays(matrix, distortion, flat.reshape(-1, 2))
     near = cv2.undistortPoints(flat, matrix, distortion, criteria=_CRITERIA)
     rays: Array = np.asarray(near, dtype=np.float64)
+    if np.size(distortion) <= _SIMPLE and np.abs(rays).max(initial=0.0) < _NEAR_AXIS:
+        return rays.reshape(-1, 2)
     points = np.concatenate([rays, np.ones((len(rays), 1, 1))], axis=2)
     back = project(lens, matrix, distortion, points)
     missed = np.flatnonzero(np.abs(back - flat[:, 0]).max(axis=1, initial=0.0) > _CONVERGED)
