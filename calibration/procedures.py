@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import radians
+from math import inf, radians
 from os import PathLike
 from pathlib import Path
 
@@ -306,7 +306,8 @@ def measure_readout(
         listener: Receives the progress.
 
     Raises:
-        BadInput: There are no tags, or the images do not determine the readout.
+        BadInput: There are no tags, or the images do not determine the readout or are rotated by
+            90°.
     """
     require_types((rig, Rig), (camera, Camera), (listener, Listener))
     wanted = positive_number("wanted", wanted, "m")
@@ -314,7 +315,8 @@ def measure_readout(
     speed = rig.motion.speed if speed is None else positive_number("speed", speed, "m/s")
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
-    pictures, to = open_timed_images(path_of(source), camera, rate), Destination.of(output)
+    rolling = replace(camera, readout=camera.readout or inf)  # takes no rotated images
+    pictures, to = open_timed_images(path_of(source), rolling, rate), Destination.of(output)
     to.require_free("readout", camera.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:

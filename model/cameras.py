@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.errors import BadInput
 from model.files.camera_file import CameraDocument, Gamma, TagDocument
 from model.pose import Array, Pose, ReadOnly, read_only
 
@@ -83,6 +84,21 @@ class Camera(ReadOnly):
             Shape (...), [s].
         """
         return np.asarray(self.readout * ((pixels[..., 1] + 0.5) / self.height - 0.5))
+
+    def require_unrotated(self, where: str) -> None:
+        """Refuses an image that had to be rotated by 90° if rows are exposed in turn.
+
+        Raises:
+            BadInput: The camera has a rolling shutter.
+        """
+        if self.readout != 0.0:
+            raise BadInput(
+                f"the image has to be rotated by 90° for camera {self.name!r}, which cannot be"
+                " combined with readout_ms",
+                where=where,
+                why="rows of the sensor are columns of that image, so it has no time per row",
+                next_step="use images as the sensor stored them, and calibrate at their size",
+            )
 
 
 def tag_from(document: TagDocument) -> Tag:

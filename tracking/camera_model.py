@@ -19,10 +19,12 @@ from model.pose import Array, require_unmasked
 from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-_CONVERGES = 5
-"""OpenCV's iteration converges up to this number of coefficients."""
+_CONVERGED = 1e-3
+"""Rays of OpenCV's iteration are refined if they miss their pixel by more, [px]."""
+_SIMPLE, _NEAR_AXIS = 5, 0.5
+"""OpenCV's iteration converges for up to this number of coefficients and these rays, [m]."""
 _NEWTON_STEPS, _LONGEST_STEP, _AT_ONCE = 30, 0.3, 100_000
-"""For rays of other lenses: iterations, largest step, and rays per batch."""
+"""For these rays: iterations, largest step, and rays per batch."""
 WIDEST = 1.5
 """Rays of a fisheye farther off the axis are clamped to this angle, below 90°, [rad], or to the one
 from which on the radius increases with the angle by less than `_LEAST_SLOPE`."""
@@ -59,10 +61,14 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
         return _fisheye_rays(matrix, distortion, flat.reshape(-1, 2))
     near = cv2.undistortPoints(flat, matrix, distortion, criteria=_CRITERIA)
     rays: Array = np.asarray(near, dtype=np.float64)
-    if np.size(distortion) > _CONVERGES:
-        parts = range(0, len(flat), _AT_ONCE)
-        for part in (slice(start, start + _AT_ONCE) for start in parts):
-            rays[part] = _refined_rays(matrix, distortion, flat[part], rays[part])
+    if np.size(distortion) <= _SIMPLE and np.abs(rays).max(initial=0.0) < _NEAR_AXIS:
+        return rays.reshape(-1, 2)
+    points = np.concatenate([rays, np.ones((len(rays), 1, 1))], axis=2)
+    back = project(lens, matrix, distortion, points)
+    missed = np.flatnonzero(np.abs(back - flat[:, 0]).max(axis=1, initial=0.0) > _CONVERGED)
+    for start in range(0, len(missed), _AT_ONCE):
+        part = missed[start : start + _AT_ONCE]
+        rays[part] = _refined_rays(matrix, distortion, flat[part], rays[part])
     return rays.reshape(-1, 2)
 
 

@@ -109,8 +109,8 @@ def clearance_at(
         pose: ``world_from_platform``.
         covariance: Of position and rotation vector about world axes, shape (6, 6), [m, rad].
         allowance: Added for errors outside the covariance, [m].
-        cable_error: Error of cable exits, 95 %, [m]; 0 to use the rig's `outlet_error` and
-            `anchor_error`.
+        cable_error: Error of cables, 95 %, anywhere along them, [m], that the covariance states for
+            their anchors; 0 to use the rig's `outlet_error` and `anchor_error`.
     """
     if not model.obstacle_names:
         return None
@@ -120,7 +120,8 @@ def clearance_at(
     ends = np.array((cable_error, 0.0) if cable_error > 0.0 else at_ends) / Z_95
 
     def uncertainty(near: Nearest) -> float:
-        variance = _variance(near, names.get(near.first), cables, pose, covariance, ends)
+        cable = names.get(near.first)
+        variance = _variance(near, cable, cables, pose, covariance, ends, cable_error > 0.0)
         return Z_95 * math.sqrt(variance) + allowance
 
     nearby = model.near(pose, _largest_difference(model.rig, covariance, ends))
@@ -145,15 +146,20 @@ def _variance(
     pose: Pose,
     spread: Array,
     ends: Array,
+    is_shared: bool,
 ) -> float:
-    """Variance of one distance, [m²]; ``ends``: deviations of outlets and anchors, [m]."""
+    """Variance of one distance, [m²]; ``ends``: deviations of outlets and anchors, [m].
+
+    ``is_shared``: the first of them is of the whole cable, from what moves both ends together.
+    """
     share, point, own = 1.0, nearest.first_point, 0.0
     if cable is not None:
         start, end = cables.exits[cable], cables.anchors[cable]
         length = float(np.linalg.norm(end - start))
         share = float(np.clip((point - start) @ (end - start) / length**2, 0.0, 1.0))
         point = end
-        own = ((1.0 - share) * ends[0]) ** 2 + (share * ends[1]) ** 2
+        at_outlet = 1.0 - share**2 if is_shared else (1.0 - share) ** 2
+        own = at_outlet * ends[0] ** 2 + (share * ends[1]) ** 2
     arm = point - pose.position
     by_pose = share * np.hstack([np.eye(3), -skew(arm)])
     covariance = by_pose @ spread @ by_pose.T

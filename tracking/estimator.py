@@ -38,10 +38,10 @@ class TrackerSettings:
         position_deviation: Largest standard deviation of the position along any direction, [m].
         jump: Largest distance from the last pose beyond what `speed` allows, [m].
         jump_angle: Largest rotation from the last pose, [rad].
-        speed: Largest expected speed of the platform, [m/s].
+        speed: Largest expected speed of the platform, [m/s]; 1.5 times the rig's if that is more.
         turn: Largest rotation from the home pose, [rad].
-        single_tag_margin: Required cost difference of a single tag's pose to its mirror pose, in
-            variances.
+        single_tag_margin: Required cost difference to the mirror pose, in variances, of the pose of
+            a single tag, or of several in one plane.
         contradiction: Largest misfit of the edges: their mean squared error, in variances of edges
             and of the tags' error. In good images it is about 1.
         doubt: The same where more than `left_out_share` of the edges were left out.
@@ -174,8 +174,7 @@ def rejection_reason(
         limits: Acceptance limits.
         views: The tags used.
         bundle: The pose, in the camera frame.
-        prior: Pose expected from camera measurements, in the same frame; it resolves the ambiguity
-            of a single tag.
+        prior: Pose expected from camera measurements, in the same frame; it resolves mirror poses.
         measured: Number of edges found on these tags and on those that were left out.
         expected: Squared error of an edge with that of the tags on the platform, in variances.
         elsewhere: Numbers of tags on the platform that are not where the pose puts them.
@@ -196,9 +195,10 @@ def rejection_reason(
     if bundle.reprojection > limits.reprojection_px:
         limit = f"the limit is {limits.reprojection_px:g} px"
         return f"the reprojection error is {bundle.reprojection:.2f} px, {limit}"
-    is_single = len(views) == 1 and bundle.second_best_cost - bundle.cost < limits.single_tag_margin
-    if is_single and (prior is None or not prior.angle_to(bundle.camera_from_body) < 0.1):
-        return f"only tag {used} is detected, and it allows two poses"
+    is_ambiguous = bundle.second_best_cost - bundle.cost < limits.single_tag_margin
+    if is_ambiguous and not bundle.is_expected(prior):
+        alone = f"tag {used} is" if len(views) == 1 else f"tags {used} in one plane are"
+        return f"only {alone} detected, which allows two poses"
     largest, _ = largest_deviations(bundle.covariance)
     if not largest <= limits.position_deviation:
         return (

@@ -1,18 +1,20 @@
 """Rigid pose of a body from all its tags at once.
 
-Each square alone allows two poses. The best of all these are refined by Levenberg–Marquardt on the
-edges of all squares with Huber's loss, so a single square's mirror pose is rejected as soon as more
-than one tag is visible.
+All squares in one plane allow two poses: with weak perspective, a plane looks the same reflected at
+the image plane. The best pose is refined by Levenberg–Marquardt on the edges of all squares with
+Huber's loss, and so is its mirror pose unless tags on several faces exclude it.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
-from scipy.special import ndtr, stdtrit
+from scipy.special import stdtrit
 
 from model.cameras import Z_95
 from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
@@ -33,6 +35,10 @@ CHANCE, FEWEST = 1.3, 4
 COVERAGE = 0.95
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
+#: Tags are in one plane if their scatter along its normal is below this share of that across it.
+FLAT = 0.1
+#: A prior decides between two poses if one is within this angle of it, [rad].
+NEAR = 0.1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,13 +57,14 @@ class BundlePose:
         camera_from_body: The pose.
         covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
         cost: Huber cost of the edges, in variances.
-        second_best_cost: Cost of the second-best pose; infinite without one.
+        second_best_cost: Cost of the second-best, or mirror, pose; infinite without one.
         freedom: Degrees of freedom: edge errors minus six.
         edge_errors: Of each tag's edges, in deviations, 0 where hidden, shape (t, 4).
         corner_errors: RMS error of each tag's corners, shape (t,), [px]; of partly hidden tags, of
             the measured edges.
         certainties: Information of each tag's edges, shape (t,), [1/px²].
         displaced: Numbers of tags left out because they are not where the pose puts them.
+        second_best: The second-best pose, if there is one.
     """
 
     camera_from_body: Pose
@@ -69,6 +76,14 @@ class BundlePose:
     corner_errors: Array
     certainties: Array
     displaced: tuple[int, ...] = ()
+    second_best: Pose | None = None
+
+    def is_expected(self, prior: Pose | None) -> bool:
+        """Whether a prior of the pose decides for it, and against the second-best one."""
+        if prior is None:
+            return False
+        rival = math.inf if self.second_best is None else prior.angle_to(self.second_best)
+        return prior.angle_to(self.camera_from_body) < min(NEAR, rival)
 
     def misfit(self, expected: float) -> float:
         """Ratio of the edges' actual variance to the stated one, from their misfit.
@@ -114,8 +129,8 @@ def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
     return np.concatenate([by_point, by_turn], axis=-1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Squares:
+@dataclass(frozen=True, eq=False)
+class Squares:
     """Corners of all tags on the body and their measured edges, stacked."""
 
     camera: Camera
@@ -124,13 +139,22 @@ class _Squares:
     target: Array  # (t, 8)
 
     @classmethod
-    def of(cls, camera: Camera, views: Sequence[TagView]) -> _Squares:
+    def of(cls, camera: Camera, views: Sequence[TagView]) -> Squares:
+        """The corners and edges of views."""
         return cls(
             camera,
             np.array([tag_corners(v.tag) for v in views]),
             np.array([v.seen.whitening for v in views]),
             np.array([v.seen.target for v in views]),
         )
+
+    @cached_property
+    def normal(self) -> Array | None:
+        """Normal of the plane of all tags in the body's frame; None if they are in no plane."""
+        points = self.corners.reshape(-1, 3)
+        arms = points - points.mean(axis=0)
+        variances, axes = np.linalg.eigh(arms.T @ arms)
+        return axes[:, 0] if variances[0] < FLAT**2 * variances[1] else None
 
     def errors(self, pose: Pose) -> Array:
         """Whitened errors of the edges, shape (t, 8)."""
@@ -159,75 +183,62 @@ def solve_pnp(
     Returns:
         The best pose, or None if no start leads to one in front of the camera.
     """
-    squares = _Squares.of(camera, views)
+    squares = Squares.of(camera, views)
     starts = [pose for view in views for pose in square_poses(camera, view)]
     starts += [prior] if prior is not None else []
     starts = [pose for pose in starts if _in_front(squares, pose)]
     ranked = sorted(starts, key=lambda pose: _huber(squares.errors(pose)))
-    found: list[tuple[float, Pose]] = []
-    rivals = _different(ranked[1:], ranked[:1])[:1]
-    for start in ranked[:1] + rivals:
-        pose = _refined(squares, start)
-        found.append((_huber(squares.errors(pose)), pose))
+    rivals = _different(ranked[1:], ranked[:1])[:1] if squares.normal is None else []
+    return _best(squares, views, ranked[:1] + rivals)
+
+
+def solve_near(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
+    """Refines a pose, or its mirror pose if tags in one plane fit that better."""
+    squares = Squares.of(camera, views)
+    return _best(squares, views, [start] if _in_front(squares, start) else [])
+
+
+def _best(squares: Squares, views: Sequence[TagView], starts: list[Pose]) -> BundlePose | None:
+    """The best of the refined poses and, of tags in one plane, of their mirror poses."""
+    found = [_costed(squares, start) for start in starts]
+    if found and squares.normal is not None:
+        mirror = _mirrored(squares, found[0][1], squares.normal)
+        found += [_costed(squares, mirror)] if _in_front(squares, mirror) else []
     if not found:
         return None
     found.sort(key=lambda item: item[0])
     cost, best = found[0]
-    others = [c for c, pose in found[1:] if not _same(pose, best)]
-    return _result(squares, views, best, cost, min(others, default=float("inf")))
+    for other, rival in found[1:]:
+        if not _same(rival, best):
+            result = _result(squares, views, best, cost, other)
+            return replace(result, second_best=rival)
+    return _result(squares, views, best, cost, math.inf)
+
+
+def _costed(squares: Squares, start: Pose) -> tuple[float, Pose]:
+    pose = _refined(squares, start)
+    return _huber(squares.errors(pose)), pose
+
+
+def _mirrored(squares: Squares, pose: Pose, normal: Array) -> Pose:
+    """A pose reflected at the image plane, and at the tags' own plane, which they do not show.
+
+    Source: Oberkampf, DeMenthon & Davis, "Iterative pose estimation using coplanar feature points",
+    CVIU 63, 1996.
+    """
+    centre = pose.apply(squares.corners).reshape(-1, 3).mean(axis=0)
+    sight, across = centre / np.linalg.norm(centre), pose.rotation @ normal
+    turn = (np.eye(3) - 2.0 * np.outer(sight, sight)) @ (np.eye(3) - 2.0 * np.outer(across, across))
+    return Pose(centre + turn @ (pose.position - centre), turn @ pose.rotation)
 
 
 def refine_pnp(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
     """Refines a pose known to be the right one; considers no alternative."""
-    squares = _Squares.of(camera, views)
+    squares = Squares.of(camera, views)
     if not _in_front(squares, start):
         return None
-    pose = _refined(squares, start)
-    return _result(squares, views, pose, _huber(squares.errors(pose)), float("inf"))
-
-
-def moved_by_pixels(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> Array:
-    """Change of a fitted pose with shifts of its corners, to first order.
-
-    Args:
-        camera: The camera.
-        views: The tags.
-        pose: ``camera_from_body`` that fits them.
-        shifts: Of each tag's undistorted corners by each of k causes, shape (t, 8, k), [px].
-
-    Returns:
-        Shift [m] and rotation [rad] along the camera's axes, shape (6, k).
-    """
-    return _by_pixels(_Squares.of(camera, views), pose, shifts)[0]
-
-
-def expected_cost(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> float:
-    """Expected cost of a fitted pose whose corners have known errors beside their scatter.
-
-    Args:
-        camera: The camera.
-        views: The tags.
-        pose: ``camera_from_body`` that fits them.
-        shifts: Of each tag's undistorted corners by each of k independent causes of unit variance,
-            shape (t, 8, k), [px].
-    """
-    left = _by_pixels(_Squares.of(camera, views), pose, shifts)[1]
-    measured = np.array([view.seen.edges for view in views])
-    scatter = max(1.0 - 3.0 / np.count_nonzero(measured), 0.0)  # the pose absorbs six errors
-    variances = scatter + np.mean(np.sum(left**2, axis=1).reshape(-1, 4, 2), axis=2)[measured]
-    # Mean Huber cost of a pair of normal errors of equal variance: Rayleigh's distribution.
-    near = 2.0 * variances * -np.expm1(-0.5 * HUBER**2 / np.maximum(variances, 1e-12))
-    beyond = 2.0 * HUBER * np.sqrt(2.0 * np.pi * variances)
-    return float(np.sum(near + beyond * ndtr(-HUBER / np.sqrt(np.maximum(variances, 1e-12)))))
-
-
-def _by_pixels(squares: _Squares, pose: Pose, shifts: Array) -> tuple[Array, Array]:
-    """Change of a pose with its corners, (6, k), and remaining edge errors, (8 t, k)."""
-    slopes = squares.jacobian(pose).reshape(-1, 6)
-    causes = (squares.whitening @ shifts).reshape(len(slopes), -1)
-    weighted = slopes * _weights(squares.errors(pose))[:, None]
-    steps = np.asarray(np.linalg.solve(slopes.T @ weighted, weighted.T @ causes))
-    return steps, causes - slopes @ steps
+    cost, pose = _costed(squares, start)
+    return _result(squares, views, pose, cost, math.inf)
 
 
 def square_poses(camera: Camera, view: TagView) -> list[Pose]:
@@ -290,8 +301,7 @@ def fit_inliers(
 ) -> tuple[list[TagView], BundlePose] | None:
     """The views without outlier edges and their pose near another; None if nothing fits."""
     for _ in range(4):
-        solve = solve_pnp if len(views) == 1 else refine_pnp  # a single tag has a mirror pose
-        bundle = solve(camera, views, start) if views else None
+        bundle = solve_near(camera, views, start) if views else None
         if bundle is None:
             return None
         kept = _without_outliers(views, bundle)
@@ -316,7 +326,7 @@ def displaced_tag(
         expected: Squared error of an edge, in variances.
         contradiction: Limit of the misfit of a tag's own edges, in `expected`.
     """
-    errors = _edge_sizes(_Squares.of(camera, views).errors(pose))
+    errors = _edge_sizes(Squares.of(camera, views).errors(pose))
     off = np.any(errors > ELSEWHERE * np.sqrt(expected), axis=1)
     for index in map(int, np.argsort(-errors.sum(axis=1))):
         view = views[index]
@@ -338,7 +348,7 @@ def _cross(a: Array, b: Array) -> Array:
     )
 
 
-def _in_front(squares: _Squares, pose: Pose) -> bool:
+def _in_front(squares: Squares, pose: Pose) -> bool:
     return bool(np.all(pose.apply(squares.corners)[..., 2] > 1e-3))
 
 
@@ -362,19 +372,19 @@ def _huber(errors: Array) -> float:
     return float(np.sum(near * (2.0 * size - near)))
 
 
-def _weights(errors: Array) -> Array:
+def huber_weights(errors: Array) -> Array:
     """Huber weight of every error, shape (8 t,)."""
     size = np.maximum(_edge_sizes(errors), 1e-12)
     return np.repeat(np.minimum(1.0, HUBER / size).reshape(-1), 2)
 
 
-def _refined(squares: _Squares, pose: Pose) -> Pose:
+def _refined(squares: Squares, pose: Pose) -> Pose:
     """Levenberg–Marquardt from an initial pose."""
     errors = squares.errors(pose)
     cost, damping = _huber(errors), 1e-4
     for _ in range(40):
         jacobian = squares.jacobian(pose).reshape(-1, 6)
-        weighted = jacobian * _weights(errors)[:, None]
+        weighted = jacobian * huber_weights(errors)[:, None]
         normal, gradient = jacobian.T @ weighted, weighted.T @ errors.reshape(-1)
         damped = normal + damping * np.diag(np.diag(normal) + 1e-9)
         step: Array = np.asarray(-np.linalg.solve(damped, gradient), dtype=np.float64)
@@ -396,11 +406,11 @@ def _refined(squares: _Squares, pose: Pose) -> Pose:
 
 
 def _result(
-    squares: _Squares, views: Sequence[TagView], pose: Pose, cost: float, rival: float
+    squares: Squares, views: Sequence[TagView], pose: Pose, cost: float, rival: float
 ) -> BundlePose:
     errors = squares.errors(pose)
     jacobian = squares.jacobian(pose).reshape(-1, 6)
-    normal = jacobian.T @ (jacobian * _weights(errors)[:, None])
+    normal = jacobian.T @ (jacobian * huber_weights(errors)[:, None])
     freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
     try:
         covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
@@ -425,7 +435,7 @@ def _certainty(seen: RefinedTag) -> float:
     return float(1.0 / np.mean(1.0 / rows))
 
 
-def _corner_errors(squares: _Squares, views: Sequence[TagView], pose: Pose) -> Array:
+def _corner_errors(squares: Squares, views: Sequence[TagView], pose: Pose) -> Array:
     """RMS error of the corners of each tag, shape (t,), [px]."""
     pixels = project_undistorted(squares.camera, pose.apply(squares.corners))
     result = []

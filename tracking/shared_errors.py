@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import ndtr
 
 from model.cameras import Z_95
 from model.errors import Fault
@@ -20,7 +21,7 @@ from model.rig import Camera, Rig, Tag
 from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
 from tracking.clearance import missing_errors
 from tracking.detection.tags import mounted_rotated, tag_corners
-from tracking.pnp import BundlePose, TagView, expected_cost, moved_by_pixels, solve_pnp
+from tracking.pnp import HUBER, BundlePose, Squares, TagView, huber_weights, solve_pnp
 
 _GRID = 7
 """Points along each side of the image at which a rotation is fitted to lens errors."""
@@ -113,6 +114,50 @@ class SharedErrors:
                 rows = slice(2 * corner, 2 * corner + 2)
                 slopes[k, rows, 6 * k : 6 * k + 6] = by_point @ shifts[corner]
         return slopes
+
+
+def moved_by_pixels(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> Array:
+    """Change of a fitted pose with shifts of its corners, to first order.
+
+    Args:
+        camera: The camera.
+        views: The tags.
+        pose: ``camera_from_body`` that fits them.
+        shifts: Of each tag's undistorted corners by each of k causes, shape (t, 8, k), [px].
+
+    Returns:
+        Shift [m] and rotation [rad] along the camera's axes, shape (6, k).
+    """
+    return _by_pixels(Squares.of(camera, views), pose, shifts)[0]
+
+
+def expected_cost(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: Array) -> float:
+    """Expected cost of a fitted pose whose corners have known errors beside their scatter.
+
+    Args:
+        camera: The camera.
+        views: The tags.
+        pose: ``camera_from_body`` that fits them.
+        shifts: Of each tag's undistorted corners by each of k independent causes of unit variance,
+            shape (t, 8, k), [px].
+    """
+    left = _by_pixels(Squares.of(camera, views), pose, shifts)[1]
+    measured = np.array([view.seen.edges for view in views])
+    scatter = max(1.0 - 3.0 / np.count_nonzero(measured), 0.0)  # the pose absorbs six errors
+    variances = scatter + np.mean(np.sum(left**2, axis=1).reshape(-1, 4, 2), axis=2)[measured]
+    # Mean Huber cost of a pair of normal errors of equal variance: Rayleigh's distribution.
+    near = 2.0 * variances * -np.expm1(-0.5 * HUBER**2 / np.maximum(variances, 1e-12))
+    beyond = 2.0 * HUBER * np.sqrt(2.0 * np.pi * variances)
+    return float(np.sum(near + beyond * ndtr(-HUBER / np.sqrt(np.maximum(variances, 1e-12)))))
+
+
+def _by_pixels(squares: Squares, pose: Pose, shifts: Array) -> tuple[Array, Array]:
+    """Change of a pose with its corners, (6, k), and remaining edge errors, (8 t, k)."""
+    slopes = squares.jacobian(pose).reshape(-1, 6)
+    causes = (squares.whitening @ shifts).reshape(len(slopes), -1)
+    weighted = slopes * huber_weights(squares.errors(pose))[:, None]
+    steps = np.asarray(np.linalg.solve(slopes.T @ weighted, weighted.T @ causes))
+    return steps, causes - slopes @ steps
 
 
 def pixels_by_lens(camera: Camera, views: Sequence[TagView]) -> Array:

@@ -39,6 +39,8 @@ from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, require_unmoved_c
 
 #: Encoder poses farther apart in time do not predict the platform's motion, [s].
 MEMORY = 0.5
+#: The platform may exceed the rig's own speed by this factor, as when it swings.
+FASTER = 1.5
 
 
 class EncoderPrior:
@@ -242,7 +244,8 @@ class Tracker:
         """Whether a pose was found that the platform can have reached since the last one."""
         if isinstance(found, NoPose):
             return False
-        limit = self.settings.jump + self.settings.speed * abs(found.time - last.time)
+        speed = max(self.settings.speed, FASTER * self.rig.motion.speed)
+        limit = self.settings.jump + speed * abs(found.time - last.time)
         if found.pose.distance_to(last.pose) > limit:
             return False
         return found.pose.angle_to(last.pose) <= self.settings.jump_angle

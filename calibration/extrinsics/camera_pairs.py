@@ -58,8 +58,8 @@ from tracking.camera_model import (
     undistort_pixels,
     undistorted_slopes,
 )
-from tracking.pnp import moved_by_pixels, pose_slopes
-from tracking.shared_errors import pixels_by_lens, split_extrinsics
+from tracking.pnp import pose_slopes
+from tracking.shared_errors import moved_by_pixels, pixels_by_lens, split_extrinsics
 
 LEAST_PAIRS = 4
 GOOD_PAIRS = 12

@@ -31,8 +31,7 @@ from model.errors import BadInput, InvalidFile, Problem
 from model.files.csv_table import CsvTable
 from model.pose import Array, Pose, moved, read_only
 from model.rig import Camera, Rig
-from tracking.pnp import moved_by_pixels
-from tracking.shared_errors import pixels_by_lens
+from tracking.shared_errors import moved_by_pixels, pixels_by_lens
 
 LEAST_POSES = 8
 """Fewer poses do not show how accurate the rig's poses are."""

@@ -123,9 +123,7 @@ def platform_pose(rig: Rig, camera: Camera, squares: Mapping[int, RefinedTag]) -
     if found is None or not np.isfinite(found.covariance).all():
         return None
     margin = found.second_best_cost - found.cost
-    if len(squares) == 1 and margin < TrackerSettings().single_tag_margin:
-        return None
-    return found
+    return None if margin < TrackerSettings().single_tag_margin else found
 
 
 def platform_views(rig: Rig, squares: Mapping[int, RefinedTag]) -> list[TagView]:

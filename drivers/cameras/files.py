@@ -63,7 +63,7 @@ class ImageFolder:
         self.unused: dict[str, str] = {}
         self._folder, self._camera = folder, camera
         self.rate = rate or camera.rate
-        self._on_unused = on_unused
+        self._on_unused = on_unused or (lambda *_: None)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -72,21 +72,24 @@ class ImageFolder:
         """Yields the images that have the camera's size.
 
         Raises:
-            BadInput: None can be read, or none has the camera's size.
+            BadInput: None can be read, or none has the camera's size; one has to be rotated, and
+                the camera has a rolling shutter.
         """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
         none_read = True
         for number, (name, path) in enumerate(zip(self.names, self.files, strict=True)):
-            image = read_picture(path, wanted)
+            stored = read_picture(path)
+            image = stored if _size(stored) == wanted else read_picture(path, wanted)
             none_read &= image is None
             if image is not None and _size(image) == wanted:
+                if image is not stored:
+                    self._camera.require_unrotated(str(path))
                 yield Frame(number / self.rate, image, name, number)
                 continue
             why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
             self.unused[name] = why
-            if self._on_unused is not None:
-                self._on_unused(name, why)
+            self._on_unused(name, why)
         if none_read:
             raise _no_picture(self._folder, self.unused)
         if len(self.unused) == len(self.files):
@@ -234,11 +237,8 @@ def _unreadable(path: Path) -> str:
 def _raw(data: bytes, upright: bool = False) -> NDArray[np.generic] | None:
     if not data or is_too_large(data):
         return None
-    flags = (
-        cv2.IMREAD_GRAYSCALE
-        | cv2.IMREAD_ANYDEPTH
-        | (0 if upright else cv2.IMREAD_IGNORE_ORIENTATION)
-    )
+    as_stored = 0 if upright else cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | as_stored
     try:
         picture = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
     except cv2.error:

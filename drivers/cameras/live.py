@@ -183,7 +183,8 @@ class VideoFile:
         rate: Images per second that the file states (default: the camera's), [Hz].
 
     Raises:
-        BadInput: The file is missing, or is not a video.
+        BadInput: The file is missing, or is not a video; its images have to be rotated by 90°, and
+            the camera has a rolling shutter.
     """
 
     def __init__(self, path: Path, camera: Camera) -> None:
@@ -389,6 +390,8 @@ def _opened_video(path: Path, camera: Camera) -> cv2.VideoCapture:
     capture = _opened(str(path))
     if _size(capture) != (camera.width, camera.height):
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        if _size(capture) == (camera.width, camera.height):
+            camera.require_unrotated(str(path))
     return capture
 
 

@@ -192,6 +192,19 @@ def test_a_fast_platform_is_followed_by_its_speed(rig: Rig, camera: Camera, empt
         assert found.pose.distance_to(truth) < 1e-3
 
 
+def test_a_platform_at_the_speed_of_its_rig_is_followed(
+    rig: Rig, camera: Camera, empty: Scene
+) -> None:
+    """60 mm from image to image: each was searched as if it were the first."""
+    fast = replace(rig, motion=replace(rig.motion, speed=1.0))
+    eye, tracker = SyntheticCamera(rig, empty, camera, seed=6), Tracker(fast, camera)
+    for frame, x in enumerate([-0.12, -0.118, -0.06, 0.0]):
+        truth = Pose.level([x, 0.1, 0.4])
+        found = tracker.observe(eye.render(truth, frame), frame * 0.1)
+        assert isinstance(found, PoseMeasurement)
+        assert found.status == ("tracked" if frame else "found")
+
+
 PLAIN = Optics(noise=1.5, blur=0.6)
 
 

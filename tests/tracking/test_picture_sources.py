@@ -204,7 +204,11 @@ def test_videos_follow_the_rule_of_images(
     matrix = struct.pack(">9i", a, b, 0, c, d, 0, 0, 0, 1 << 30)
     path.write_bytes(data[:at] + matrix + data[at + 36 :])
     size = (96, 128) if is_portrait else (128, 96)
-    video = VideoFile(path, replace(camera, width=size[0], height=size[1]))
+    taken_by = replace(camera, width=size[0], height=size[1])
+    if is_portrait and degrees in (90, 270):
+        with pytest.raises(BadInput, match="readout_ms"):
+            VideoFile(path, replace(taken_by, readout=0.03))
+    video = VideoFile(path, taken_by)
     if is_portrait and degrees in (0, 180):
         with pytest.raises(BadInput, match="the image has 128 x 96 px"):
             list(video)
@@ -213,6 +217,17 @@ def test_videos_follow_the_rule_of_images(
     (frame,) = video
     assert np.median(np.abs(frame.image.astype(int) - expected)) < 8
     assert video_size(path) == ((96, 128) if degrees in (90, 270) else (128, 96))
+
+
+def test_rotated_images_of_a_rolling_shutter_are_refused(tmp_path: Path, camera: Camera) -> None:
+    """They were corrected along the wrong axis; as stored they are used."""
+    (tmp_path / "a.jpg").write_bytes(jpeg(CORNER, 6))
+    rolling = replace(camera, width=64, height=48, readout=0.03)
+    assert len(list(ImageFolder(tmp_path, rolling))) == 1
+    portrait = replace(rolling, width=48, height=64)
+    with pytest.raises(BadInput, match="readout_ms"):
+        list(ImageFolder(tmp_path, portrait))
+    assert len(list(ImageFolder(tmp_path, replace(portrait, readout=0.0)))) == 1
 
 
 def test_a_folder_of_broken_files_only_is_refused(tmp_path: Path, camera: Camera) -> None:
