@@ -140,7 +140,7 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     if not course.final_state:
         course = _ended_by_events(course, cycles, events)
     if len(cycles) == course.cycles - 1 and not folder.has(CYCLES):
-        cycles = folder.cycles()  # which refuses a last row that is cut short
+        cycles = _with_last_row(folder, cycles)
     troubles = list(course.troubles)
     if (lost := course.cycles - len(cycles)) > 0:
         troubles.append(f"Of {course.cycles} cycles the last {lost} are not on record")
@@ -166,6 +166,16 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
     context = RunContext(plan, rig, course, tuple(events))
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, folder.poses_by_camera(), clearance, summary)
+
+
+def _with_last_row(folder: RunFolder, cycles: CycleTable) -> CycleTable:
+    """All cycles if the last row, which lacks its line break, is whole: as it would be written."""
+    try:
+        table = folder.cycles()
+    except BadInput:
+        return cycles
+    last = (folder.path / CYCLES).read_bytes().rpartition(b"\n")[2].removesuffix(b"\r")
+    return table if table.csv_rows(first=-1).encode() == last + b"\n" else cycles
 
 
 def _ended_by_events(

@@ -23,7 +23,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from drivers.can_bus import BusSettings
-from executor.interlock.locks import locked_within, open_lock, read_state_file, state_files
+from executor.interlock.locks import (
+    WRITABLE,
+    locked_within,
+    open_lock,
+    read_state_file,
+    state_files,
+)
 from executor.state_machine import State
 from model.errors import BadInput, CdprError, Refused, StoppedByOperator
 from model.files.documents import write_atomic
@@ -346,7 +352,7 @@ class FaultLatch:
             "the fault latch cannot be written",
             where=str(self.path),
             why=why or "the operating system gives no reason",
-            next_step="make the folder writable for the operators of the rig",
+            next_step=WRITABLE,
         )
 
 

@@ -27,6 +27,11 @@ DEVICES = Path("/sys/class/tty")
 #: Shorter serial numbers are those of a maker who gives all adapters the same, [characters].
 #: Source: Silicon Labs, CP2102 data sheet: "0001".
 SHORTEST_SERIAL = 5
+#: What to do if a file of the state folder cannot be written.
+WRITABLE = (
+    "make the folder writable for the operators of the rig; if its file system is the cause, keep"
+    " it on a local disk (docs/commissioning.md)"
+)
 #: A latch, or a reference of many cables, has a few kilobytes.
 LARGEST_FILE = 65_536
 
@@ -296,7 +301,7 @@ class SetUpLock:
                 "exclusive access to the drives cannot be ensured",
                 where=str(self._path),
                 why=error.strerror or str(error),
-                next_step="make the folder writable for the operators of the rig",
+                next_step=WRITABLE,
             ) from None
         try:
             if not locked_within(lock, READ_TIMEOUT):

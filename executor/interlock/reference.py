@@ -22,7 +22,7 @@ from pydantic import Field, ValidationError
 
 from drivers.can_bus import BusSettings
 from drivers.plausibility import HOME
-from executor.interlock.locks import read_state_file, state_files
+from executor.interlock.locks import WRITABLE, read_state_file, state_files
 from model.errors import CdprError, Refused
 from model.files.documents import Document, PoseDocument, content_hash, document_hash, write_atomic
 from model.kinematics import cable_lengths
@@ -224,7 +224,7 @@ class ReferenceFile:
                 "the homing reference cannot be removed",
                 where=str(self.path),
                 why=error.strerror or str(error),
-                next_step="make the folder writable for the operators of the rig",
+                next_step=WRITABLE,
             ) from None
 
     def write(self, reference: HomingReference) -> None:
@@ -245,7 +245,7 @@ class ReferenceFile:
                 "the homing reference cannot be written",
                 where=str(path),
                 why=error.why if isinstance(error, CdprError) else error.strerror or str(error),
-                next_step="make the folder writable for the rig's operators, then run `cdpr home`",
+                next_step=f"{WRITABLE}, then run `cdpr home`",
             ) from None
 
 

@@ -54,12 +54,13 @@ def require_unchanged(folder: Path) -> None:
         found = _LINE.fullmatch(line)
         if found is None:
             raise BadInput("not a checksum", where=f"{path}:{number}", next_step=AGAIN)
-        if not _RECORD.fullmatch(found[2]):
+        name = found[2].removeprefix("./")
+        if not _RECORD.fullmatch(name):
             continue
-        if not (folder / found[2]).is_file():
-            changed += [f"{found[2]} (missing)"] if found[2] not in REBUILT else []
-        elif _checksum(folder / found[2]) != found[1]:
-            changed.append(found[2])
+        if not (folder / name).is_file():
+            changed += [f"{name} (missing)"] if name not in REBUILT else []
+        elif _checksum(folder / name) != found[1]:
+            changed.append(name)
     if changed:
         raise BadInput(
             f"changed after the run: {', '.join(changed)}",

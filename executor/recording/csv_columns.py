@@ -81,6 +81,8 @@ class Columns:
         """The columns of an attribute's values."""
         if self.kind is str:
             return [Column(self.names[0], values, self.form)]
+        if self.kind is int:
+            return [Column(name, values[:, *at], self.form) for name, at, _ in self._entries()]
         return [Column(name, values[:, *at] * by, self.form) for name, at, by in self._entries()]
 
     def read(self, file: TableFile) -> Any:
@@ -174,15 +176,15 @@ class Table:
         """The first line of the file."""
         return ",".join(quoted(column.name) for column in self.columns()) + "\n"
 
-    def csv_rows(self) -> str:
-        """All lines of the file except the first."""
+    def csv_rows(self, first: int = 0) -> str:
+        """All lines of the file except the header, from a row on."""
         columns = self.columns()
         # One format for the whole row: twenty times faster than csv.writer with a format per value.
         form = ",".join(column.form for column in columns) + "\n"
         values = [
-            column.values.tolist()
+            column.values[first:].tolist()
             if isinstance(column.values, np.ndarray)
-            else map(quoted, column.values)
+            else map(quoted, column.values[first:])
             for column in columns
         ]
         return "".join(form % row for row in zip(*values, strict=True))

@@ -76,9 +76,9 @@ def _tags(poses: PoseTable, start: int, camera: str = "") -> Iterator[Message]:
         yield topic_of("/tag_status", camera), time, content
 
 
-def _records(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+def _records(columns: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
     """A dict for each row of columns."""
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return (dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True))
 
 
 def _pictures(
@@ -195,16 +195,18 @@ def _cycles(cycles: CycleTable, start: int) -> Iterator[Message]:
 
 
 def _drives(cycles: CycleTable) -> Iterator[Message]:
-    columns = {column.name: _json(column) for column in cycles.columns()}
+    columns = {column.name: column for column in cycles.columns()}
     *heads, drives = DRIVES["properties"]
     each = DRIVES["properties"][drives]["items"]["properties"]
-    contents = _records({name: columns[name] for name in heads})
+    contents = _records({name: _json(columns[name]) for name in heads})
     cables = [
-        _records({name: columns[f"_{i}_".join(name.rsplit("_", 1))] for name in each})
+        _records({name: _json(columns[f"_{i}_".join(name.rsplit("_", 1))]) for name in each})
         for i in range(1, cycles.cable_count + 1)
     ]
+    del columns  # a long run's numbers are as many bytes as its table
     for time, content, *parts in zip(cycles.time.tolist(), contents, *cables, strict=True):
-        yield "/drives", time, {**content, drives: parts}
+        content[drives] = parts
+        yield "/drives", time, content
 
 
 def _json(column: Column) -> Sequence[Any]:
@@ -216,8 +218,8 @@ def _clearance(clearance: ClearanceTable) -> Iterator[Message]:
     near = values_of(clearance.distances * 1e3)
     planned = values_of(clearance.planned_distances * 1e3)
     keys = ("distance_mm", "uncertainty_mm", "at_most_mm", "planned_distance_mm")
-    columns = {column.name: _json(column) for column in clearance.columns()}
-    values = zip(*(columns[key] for key in keys), strict=True)
+    columns = {column.name: column for column in clearance.columns()}
+    values = zip(*(_json(columns[key]) for key in keys), strict=True)
     for i, row in enumerate(values):
         camera = camera_of(clearance.source[i])
         each = zip(clearance.obstacles, near[i], planned[i], strict=True)

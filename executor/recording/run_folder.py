@@ -165,10 +165,10 @@ class RunFolder:
         return BadInput(what, where=str(self.path), why=why, next_step=then)
 
     def has(self, name: str) -> bool:
-        """Whether a file exists, not empty, and ends with a whole line if it can be made again."""
+        """Whether a file exists, not empty, and is whole if it was appended to or can be cut."""
         with suppress(OSError), (self.path / name).open("rb") as stream:
             stream.seek(-1, os.SEEK_END)
-            return stream.read() == b"\n" or name not in (CYCLES, *REBUILT - {SUMMARY})
+            return stream.read() == b"\n" or name not in (CYCLES, MCAP)
         return False
 
     @property
@@ -262,9 +262,9 @@ class RunFolder:
             BadInput: A complete line cannot be read.
         """
         path = self.path / CYCLES
-        text = "\n".join(whole_lines(path)) if path.is_file() else ""
-        table = CycleTable.of_file(TableFile(path, text)) if text else CycleTable.empty(cable_count)
-        return self._with_cables(table, cable_count)
+        if not (path.is_file() and (lines := whole_lines(path))):
+            return CycleTable.empty(cable_count)
+        return self._with_cables(CycleTable.of_file(TableFile(path, "\n".join(lines))), cable_count)
 
     def _with_cables(self, table: CycleTable, cables: int) -> CycleTable:
         if table.cable_count != cables:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 import executor
-from drivers.can_bus import IN_PROCESS
 from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord, RunCourse
 from executor.recording.run_folder import RunEvent
@@ -117,10 +116,9 @@ def judge(
     course, rig, scene = context.course, context.rig, context.plan.scene
     final_state, began = course.final_state, cycles.path_began
     warnings = context.texts_of("drive_warning")
-    in_process = context.simulated and course.interface == IN_PROCESS
     measured = [
         following(cycles, rig.motion.following_error),
-        replies(cycles, in_process, bool(context.texts_of("drive_silent"))),
+        replies(cycles, course.simulated, bool(context.texts_of("drive_silent"))),
         *tensions(cycles, rig),
         *distances(clearance, scene.obstacle_clearance, course.cameras, began),
         *encoder_pose(cycles),

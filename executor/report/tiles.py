@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from executor.recording.tables import PoseTable
-from executor.recording.verdict import faults_among, page_of, page_text
+from executor.recording.verdict import NOT_ENDED, faults_among, page_of, page_text
 from executor.report.run_data import RunData, markdown, missing_images
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.files.reading import is_too_large
@@ -49,9 +49,12 @@ def chips(summary: dict[str, Any]) -> str:
         f"{drives}, bus {summary['interface']}",
         f"{time}, {summary['cycle_ms']:g} ms a cycle",
     ]
-    has_images = summary["tag_error_mm"] is not None
-    without = "camera without images" if summary["cameras"] else "no camera"
-    words.append("camera and tags" if has_images else without)
+    if summary["tag_error_mm"] is not None:
+        words.append("camera and tags")
+    elif summary["cameras"]:
+        words.append("camera without images")
+    elif summary["final_state"] != NOT_ENDED:  # else a killed run's cameras are not on record
+        words.append("no camera")
     return f'<ul class="chips">{"".join(f"<li>{escape(word)}</li>" for word in words)}</ul>'
 
 

@@ -124,7 +124,7 @@ class Visit:
 
         A click before the first frame is drawn picks nothing.
         """
-        for _ in range(10):
+        for _ in range(100):
             self.page.locator("#scene-canvas").click()
             self.page.wait_for_timeout(100)
             if " mm" in self.page.locator("#pick-text").inner_text():

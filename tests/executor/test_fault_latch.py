@@ -270,8 +270,9 @@ def test_nothing_moves_where_a_power_failure_may_lose_the_latch(
         fsync(handle)
 
     monkeypatch.setattr(os, "fsync", of_files)
-    with pytest.raises(Refused, match="file system cannot sync folders"):
+    with pytest.raises(Refused, match="file system cannot sync folders") as caught:
         mine.engage("a rig", folder)
+    assert "on a local disk" in caught.value.next_step
     assert mine.read() is None
 
 

@@ -210,6 +210,8 @@ def test_a_camera_without_images_is_not_called_no_camera(run: fake_run.FakeRun) 
     found = chips({**summary, "cameras": [failed]})
     assert "no camera" not in found
     assert "camera without images" in found
+    killed = chips({**summary, "final_state": "not_ended"})  # its cameras are not on record
+    assert "camera" not in killed
 
 
 def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(

@@ -267,7 +267,7 @@ def test_poses_without_a_final_newline_are_read_and_stay(filmed: RunFolder, tmp_
     """As a spreadsheet may save them; nothing replaces them."""
     folder = without(filmed, tmp_path / "run", "SHA256SUMS", "run.mcap")
     poses, summary = folder.path / "poses.csv", folder.path / "summary.json"
-    for path in (poses, summary):
+    for path in (poses, summary, folder.path / "clearance.csv"):
         path.write_bytes(path.read_bytes().rstrip(b"\n"))
     before = poses.read_bytes(), summary.read_bytes()
     rewrite_report(RunFolder.open_cut_short(folder.path))
@@ -288,9 +288,13 @@ def test_a_last_cycle_without_a_newline_counts_if_it_is_whole(
     whole = path.read_bytes()
     path.write_bytes(whole.rstrip(b"\n"))
     assert evaluate_folder(folder).summary["verdict"] == "PASSED"
-    path.write_bytes(whole[: whole.rstrip(b"\n").rfind(b"\n") + 20])
-    with pytest.raises(BadInput, match=r"line \d+ has 3 values"):
-        evaluate_folder(folder)
+    tensions = evaluate_folder(folder).summary["tension_n"]
+    row = whole.rstrip(b"\n").rfind(b"\n") + 1
+    for end in (row + 20, whole.rfind(b",") + 2, len(whole) - 2):
+        path.write_bytes(whole[:end])
+        summary = evaluate_folder(folder).summary
+        assert "the last 1 are not on record" in str(summary)
+        assert summary["tension_n"] == tensions
 
 
 def test_checksums_of_further_files_are_ignored(filmed: RunFolder, tmp_path: Path) -> None:
@@ -300,6 +304,14 @@ def test_checksums_of_further_files_are_ignored(filmed: RunFolder, tmp_path: Pat
     others = "".join(f"{'0' * 64}  {name}\n" for name in ("report.html", "pictures/a.jpg", "a b"))
     sums.write_text(sums.read_text() + others)
     assert cdpr.load_run(folder.path).passed
+    sums.write_text(sums.read_text().replace("  ", "  ./"))  # as `sha256sum ./*` lists them
+    assert cdpr.load_run(folder.path).passed
+    events = folder.path / "events.jsonl"
+    kept = events.read_bytes()
+    events.write_bytes(kept + b"\n")
+    with pytest.raises(BadInput, match=r"changed after the run: events\.jsonl"):
+        cdpr.load_run(folder.path)
+    events.write_bytes(kept)
     sums.write_text(sums.read_text() + "report.html\n")
     with pytest.raises(BadInput, match="not a checksum"):
         cdpr.load_run(folder.path)

@@ -402,6 +402,16 @@ def test_cycles_without_rows_round_trip(tmp_path: Path, run: fake_run.FakeRun) -
     assert (len(again), again.cable_count) == (0, 8)
 
 
+@pytest.mark.parametrize("text", ["\n", "\n\n"])
+def test_a_record_of_blank_lines_is_refused(
+    tmp_path: Path, run: fake_run.FakeRun, text: str
+) -> None:
+    folder = fake_run.write(run, tmp_path / "run", pictures=False)
+    (folder.path / "cycles.csv").write_text(text)
+    with pytest.raises(BadInput, match=r"cycles\.csv"):
+        folder.cycles_cut_short(8)
+
+
 def test_a_record_without_cables_is_refused(tmp_path: Path, run: fake_run.FakeRun) -> None:
     folder = fake_run.write(run, tmp_path / "run", pictures=False)
     CycleTable.empty(cables=0).write_csv(folder.path / "cycles.csv")

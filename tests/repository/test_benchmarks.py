@@ -114,7 +114,7 @@ def test_a_path_counts_at_a_mark_only_if_it_was_known_by_then(
     import ours
 
     for name in ("ours", "compiled_rrt", "result"):
-        monkeypatch.delitem(sys.modules, name)
+        del sys.modules[name]
     rounds = iter([(0.4, 5.0), (1.5, 4.0), (30.0, 3.0)])
     clock = SimpleNamespace(now=0.0)
 

@@ -17,7 +17,7 @@ export class Operate {
   #files = {}; // names listed so far, by group
   #busy = null;
   #sliding = false; // the operator moves the slider: the run's status must not
-  #sending = false; // nor while the new speed is on its way
+  #sending = 0; // nor while a new speed is on its way
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text, failed)` and `scene`. */
   constructor(page) {
@@ -30,9 +30,9 @@ export class Operate {
       write(at("speed-shown"), `${at("speed").value} %`);
     });
     at("speed").addEventListener("change", async () => {
-      this.#sending = true;
+      this.#sending += 1;
       await page.command("speed", { percent: Number(at("speed").value) });
-      this.#sending = false;
+      this.#sending -= 1;
     });
     // After "change", which does not come if the slider was put back.
     for (const end of ["change", "pointerup", "pointercancel", "blur"]) at("speed").addEventListener(end, () => setTimeout(() => (this.#sliding = false)));
