@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
 
@@ -272,7 +272,7 @@ def open_source(source: ImageSource, camera: Camera, wanted: int | None, usual: 
         folder = SingleCameraImages(path, (camera.width, camera.height))
         return ImageSet(folder, len(folder.names), folder.unused)
     if path.is_file():
-        return _sampled(VideoFile(path, camera), most)
+        return _sampled(VideoFile(path, replace(camera, readout=0.0)), most)  # corrects no rows
     require_camera_source(str(source))
     return ImageSet(_live(str(source), camera, most), most, is_live=True)
 

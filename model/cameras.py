@@ -97,7 +97,8 @@ class Camera(ReadOnly):
                 " combined with readout_ms",
                 where=where,
                 why="rows of the sensor are columns of that image, so it has no time per row",
-                next_step="use images as the sensor stored them, and calibrate at their size",
+                next_step="remove the orientation from the files (of images EXIF, of videos the"
+                " rotation) and calibrate again, or record in landscape",
             )
 
 

@@ -21,8 +21,9 @@ from model.rig import Camera
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
 _CONVERGED = 1e-3
 """Rays of OpenCV's iteration are refined if they miss their pixel by more, [px]."""
-_SIMPLE, _NEAR_AXIS = 5, 0.5
-"""OpenCV's iteration converges for up to this number of coefficients and these rays, [m]."""
+_SIMPLE, _BEND = 5, 0.4
+"""OpenCV's iteration converges for up to this number of coefficients, where the radial terms change
+the scale along the radius by less than this share."""
 _NEWTON_STEPS, _LONGEST_STEP, _AT_ONCE = 30, 0.3, 100_000
 """For these rays: iterations, largest step, and rays per batch."""
 WIDEST = 1.5
@@ -61,7 +62,7 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
         return _fisheye_rays(matrix, distortion, flat.reshape(-1, 2))
     near = cv2.undistortPoints(flat, matrix, distortion, criteria=_CRITERIA)
     rays: Array = np.asarray(near, dtype=np.float64)
-    if np.size(distortion) <= _SIMPLE and np.abs(rays).max(initial=0.0) < _NEAR_AXIS:
+    if np.size(distortion) <= _SIMPLE and _bend(distortion, rays) < _BEND:
         return rays.reshape(-1, 2)
     points = np.concatenate([rays, np.ones((len(rays), 1, 1))], axis=2)
     back = project(lens, matrix, distortion, points)
@@ -70,6 +71,13 @@ def rays_of(lens: str, matrix: Array, distortion: Array, pixels: Array) -> Array
         part = missed[start : start + _AT_ONCE]
         rays[part] = _refined_rays(matrix, distortion, flat[part], rays[part])
     return rays.reshape(-1, 2)
+
+
+def _bend(distortion: Array, rays: Array) -> float:
+    """Bound on the change of scale along the radius by k1, k2 and k3, over rays of a batch."""
+    squared = float((rays**2).sum(axis=-1).max(initial=0.0))
+    k1, k2, _, _, k3 = np.abs(np.resize(np.append(distortion, np.zeros(5)), 5))
+    return float(squared * (2.0 * k1 + squared * (4.0 * k2 + squared * 6.0 * k3)))
 
 
 def _fisheye_rays(matrix: Array, distortion: Array, pixels: Array) -> Array:

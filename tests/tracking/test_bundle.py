@@ -237,11 +237,13 @@ def test_a_start_behind_the_camera_gives_no_pose(rig: Rig) -> None:
 
 @pytest.mark.parametrize(
     ("focal", "distortion"),
-    [(530.0, (-0.28, 0.08, 0.0, 0.0)), (600.0, (-0.33, 0.12, 0.0, 0.0, 0.0))],
+    [
+        (530.0, (-0.28, 0.08, 0.0, 0.0)),
+        (600.0, (-0.33, 0.12, 0.0, 0.0, 0.0)),
+        (1400.0, (0.1, -1.5, 0.0, 0.0, 10.0)),
+    ],
 )
-def test_the_corners_of_a_wide_lens_are_undistorted(
-    focal: float, distortion: tuple[float, ...]
-) -> None:
+def test_the_corners_of_a_lens_are_undistorted(focal: float, distortion: tuple[float, ...]) -> None:
     """OpenCV's iteration was off by up to 17 px there."""
     camera = generic_camera((1280, 720))
     matrix = np.array([[focal, 0.0, 639.5], [0.0, focal, 359.5], [0.0, 0.0, 1.0]])

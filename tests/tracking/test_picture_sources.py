@@ -13,6 +13,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from calibration.pictures import open_source
 from drivers.cameras.files import ImageFolder, SingleCameraImages, first_gap
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from model.errors import BadInput, HardwareMissing
@@ -208,6 +209,8 @@ def test_videos_follow_the_rule_of_images(
     if is_portrait and degrees in (90, 270):
         with pytest.raises(BadInput, match="readout_ms"):
             VideoFile(path, replace(taken_by, readout=0.03))
+        # Calibrations at rest correct no rows.
+        assert len(list(open_source(path, replace(taken_by, readout=0.03), None, 1).images)) == 1
     video = VideoFile(path, taken_by)
     if is_portrait and degrees in (0, 180):
         with pytest.raises(BadInput, match="the image has 128 x 96 px"):
@@ -225,8 +228,9 @@ def test_rotated_images_of_a_rolling_shutter_are_refused(tmp_path: Path, camera:
     rolling = replace(camera, width=64, height=48, readout=0.03)
     assert len(list(ImageFolder(tmp_path, rolling))) == 1
     portrait = replace(rolling, width=48, height=64)
-    with pytest.raises(BadInput, match="readout_ms"):
+    with pytest.raises(BadInput, match="readout_ms") as caught:
         list(ImageFolder(tmp_path, portrait))
+    assert "remove the orientation" in caught.value.next_step
     assert len(list(ImageFolder(tmp_path, replace(portrait, readout=0.0)))) == 1
 
 
