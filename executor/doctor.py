@@ -252,7 +252,7 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
         text = f"missing; CAN interfaces here: {there}"
         return [MachineCheck(f"interface {name}", False, text, bring_up(settings))]
     checks = [_up(found, settings), _queue(found)]
-    if found.has_hardware:
+    if found.kind == "can":
         again = set_up_again(name, settings.bitrate)
         checks += [_bitrate(found, settings.bitrate, again), _controller(found, again)]
     return checks
