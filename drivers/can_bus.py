@@ -28,10 +28,15 @@ from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
 
 UDP_DEFAULT_GROUP = "239.74.163.2"
-"""Default IPv4 group. Source: python-can, interfaces/udp_multicast."""
-
 UDP_DEFAULT_PORT = 43113
-"""Default port. Source: python-can, interfaces/udp_multicast."""
+"""Defaults of python-can, interfaces/udp_multicast; the group is that of IPv4."""
+
+UNUSABLE = {
+    "cantact": "python-can's back end gives a sender its own frames",
+    "gs_usb": "python-can's back end gives a sender its own frames and hides failures of reading",
+    "socketcand": "TCP may deliver set-points late, and several at once",
+}
+"""Interfaces of python-can that cannot command drives, and why."""
 
 IN_PROCESS = "virtual"
 """python-can's interface within one process; a run simulates its drives on it."""
@@ -133,13 +138,14 @@ def open_bus(settings: BusSettings) -> can.BusABC:
             of its channels.
         HardwareMissing: It cannot be opened.
     """
-    known = sorted(set(can.VALID_INTERFACES) - {"gs_usb"})
-    if settings.interface == "gs_usb":
+    known = sorted(set(can.VALID_INTERFACES) - set(UNUSABLE))
+    if settings.interface in UNUSABLE:
         raise BadInput(
-            "the CAN interface 'gs_usb' cannot be used",
+            f"the CAN interface {settings.interface!r} cannot be used",
             where="bus.interface",
-            why="python-can's back end gives a sender its own frames and hides failures of reading",
-            next_step="use the kernel driver of the same name: interface: socketcan, channel: can0",
+            why=UNUSABLE[settings.interface],
+            next_step="use the adapter by its kernel driver, such as gs_usb, on this computer:"
+            " interface: socketcan, channel: can0",
         )
     if settings.interface not in known:
         raise BadInput(
@@ -178,7 +184,10 @@ def _close_unopened(error: Exception) -> None:
 def _options(settings: BusSettings) -> dict[str, Any]:
     if settings.interface == "udp_multicast":
         return _udp_options(settings)
-    return {"channel": settings.channel, "bitrate": settings.bitrate}
+    options: dict[str, Any] = {"channel": settings.channel, "bitrate": settings.bitrate}
+    if settings.interface == "neovi":  # its default is to receive them
+        options["receive_own_messages"] = False
+    return options
 
 
 def _udp_options(settings: BusSettings) -> dict[str, Any]:
@@ -193,11 +202,7 @@ def _udp_options(settings: BusSettings) -> dict[str, Any]:
             next_step="the channel is a multicast address, such as 239.74.163.77 or"
             " 239.74.163.77:43114",
         )
-    options: dict[str, Any] = {
-        "channel": group or UDP_DEFAULT_GROUP,
-        "hop_limit": 0,
-        "fd": False,
-    }
+    options: dict[str, Any] = {"channel": group or UDP_DEFAULT_GROUP, "hop_limit": 0, "fd": False}
     if port:
         if not port.isdecimal() or not 0 < int(port) < 65536:
             raise BadInput(
@@ -379,11 +384,11 @@ class KernelInterface:
 
     Attributes:
         name: Such as ``can0``.
-        kind: ``can``, or ``vcan`` without hardware.
+        kind: ``can`` with a controller, which has a bit rate, or ``vcan`` without.
         up: Whether it is up.
         queue: Length of the transmit queue, [frames].
-        bitrate: [bit/s]; None if not set.
-        state: Of the controller, such as ``ERROR-ACTIVE``; may be empty.
+        bitrate: [bit/s]; None if not set, or if the driver states none, as with slcand.
+        state: Of the controller, such as ``ERROR-ACTIVE``; empty if the driver states none.
     """
 
     name: str
@@ -392,11 +397,6 @@ class KernelInterface:
     queue: int
     bitrate: int | None
     state: str
-
-    @property
-    def has_hardware(self) -> bool:
-        """Whether it has a controller with a bit rate."""
-        return self.kind == "can"
 
 
 def parse_interfaces(text: str) -> tuple[KernelInterface, ...]:

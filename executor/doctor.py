@@ -252,7 +252,7 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
         text = f"missing; CAN interfaces here: {there}"
         return [MachineCheck(f"interface {name}", False, text, bring_up(settings))]
     checks = [_up(found, settings), _queue(found)]
-    if found.has_hardware:
+    if found.kind == "can":
         again = set_up_again(name, settings.bitrate)
         checks += [_bitrate(found, settings.bitrate, again), _controller(found, again)]
     return checks
@@ -288,16 +288,20 @@ def _queue(found: KernelInterface) -> MachineCheck:
 
 
 def _bitrate(found: KernelInterface, wanted: int, again: str) -> MachineCheck:
+    name = f"bit rate of {found.name}"
+    if found.up and found.bitrate is None:  # of other adapters the kernel requires one
+        text = f"not stated by its driver; the rig file says {wanted} (slcand sets it by -s)"
+        return MachineCheck(name, True, text)
     text = f"{found.bitrate} bit/s" if found.bitrate else "not set"
     if found.bitrate != wanted:
         text += f"; the rig file says {wanted}"
-    return MachineCheck(f"bit rate of {found.name}", found.bitrate == wanted, text, again)
+    return MachineCheck(name, found.bitrate == wanted, text, again)
 
 
 def _controller(found: KernelInterface, again: str) -> MachineCheck:
-    healthy = found.state in HEALTHY
+    healthy = not found.state or found.state in HEALTHY
     fix = f"check power, cable and termination (60 ohm), then {again}"
-    text = found.state or "unknown"
+    text = found.state or "not stated by its driver"
     # While down it has no state to report; `_up` reports that.
     return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
 

@@ -117,7 +117,7 @@ def test_a_healthy_interface_has_nothing_to_fix() -> None:
             "bitrate 1000000",
         ),
         (
-            {"linkinfo": {"info_kind": "can", "info_data": {}}},
+            {"flags": ["NOARP", "ECHO"], "linkinfo": {"info_kind": "can", "info_data": {}}},
             "bit rate of can0",
             "not set; the rig file says 1000000",
             "bitrate 1000000",
@@ -137,6 +137,28 @@ def test_what_is_wrong_comes_with_its_command(
     assert not answer.good
     assert found in answer.text
     assert command in answer.fix
+
+
+@pytest.mark.parametrize(
+    ("linkinfo", "state"),
+    [
+        ({}, "not stated by its driver"),  # before Linux 6.0
+        (
+            {"info_kind": "can", "info_data": {"state": "ERROR-ACTIVE", "bittiming_bitrate": 0}},
+            "ERROR-ACTIVE",
+        ),
+    ],
+)
+def test_a_serial_adapter_set_up_by_slcand_states_no_bit_rate(
+    linkinfo: dict[str, Any], state: str
+) -> None:
+    """A run accepts it, and `type can bitrate`, which was the cure, does not fit it."""
+    answers = looked(linkinfo=linkinfo)
+    assert len(answers) == 4
+    assert all(answer.good for answer in answers.values())
+    text = answers["bit rate of can0"].text
+    assert text == "not stated by its driver; the rig file says 1000000 (slcand sets it by -s)"
+    assert answers["controller of can0"].text == state
 
 
 def test_a_missing_interface_names_those_that_are_there() -> None:

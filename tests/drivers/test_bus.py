@@ -24,15 +24,47 @@ def with_bus(rig: Rig, **changes: object) -> Rig:
     return rig_from_document(RigDocument.model_validate(document))
 
 
-def test_gs_usb_is_refused_in_favour_of_the_kernel_driver(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It took the channel's text for a number, and its own frames for another master's."""
+@pytest.mark.parametrize(
+    ("interface", "channel", "why", "instead"),
+    [
+        ("gs_usb", "0", "its own frames", "interface: socketcan, channel: can0"),
+        ("cantact", "0", "its own frames", "interface: socketcan, channel: can0"),
+        ("socketcand", "can0", "TCP", "interface: socketcan, channel: can0"),
+        ("socketcand", "10.0.0.5:29536/can0", "TCP", "interface: socketcan, channel: can0"),
+    ],
+)
+def test_an_interface_that_cannot_command_drives_is_refused_with_what_to_use(
+    monkeypatch: pytest.MonkeyPatch, interface: str, channel: str, why: str, instead: str
+) -> None:
+    """Own frames pass for another master's; socketcand failed for want of a host and a port."""
     monkeypatch.setattr(can, "Bus", lambda **_options: pytest.fail("it was opened"))
+    with pytest.raises(BadInput, match=f"'{interface}' cannot be used") as caught:
+        open_bus(BusSettings(interface, channel))
+    assert why in caught.value.why
+    assert instead in caught.value.next_step
     with pytest.raises(BadInput) as caught:
-        open_bus(BusSettings("gs_usb", "0"))
-    assert "interface: socketcan" in caught.value.next_step
-    with pytest.raises(BadInput) as caught:
-        open_bus(BusSettings("gs-usb", "0"))
-    assert "gs_usb" not in caught.value.next_step
+        open_bus(BusSettings("gs-usb", channel))
+    assert f" {interface}," not in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("interface", "own_frames"),
+    [("neovi", {"receive_own_messages": False}), ("kvaser", {}), ("pcan", {})],
+)
+def test_a_back_end_that_returns_sent_frames_by_default_is_kept_from_it(
+    monkeypatch: pytest.MonkeyPatch, interface: str, own_frames: dict[str, bool]
+) -> None:
+    """Every run was refused: another program commands drive 1."""
+    asked: dict[str, object] = {}
+
+    def opened(**options: object) -> can.BusABC:
+        asked.update(options)
+        return InProcessBus("own-frames")
+
+    monkeypatch.setattr(can, "Bus", opened)
+    open_bus(BusSettings(interface, "1", 500_000)).shutdown()
+    expected = {"interface": interface, "ignore_config": True, "channel": "1", "bitrate": 500_000}
+    assert asked == expected | own_frames
 
 
 def test_an_unknown_interface_lists_those_there_are() -> None:
