@@ -193,7 +193,7 @@ def configure_drives(
     _check_supply(link, layouts, nodes)
     if known is not None:
         for node in nodes:
-            for wanted in wanted_settings(document):
+            for wanted in wanted_settings(document, layouts):
                 _set(link, layouts, node, known.by_name[wanted.name], wanted)
     for winch in rig.winches:
         turns = SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
@@ -205,8 +205,9 @@ def configure_drives(
     if known is not None:
         return ()
     return (
-        "the drives' watchdog and message periods were not read back, because the rig file names"
-        " no drives.endpoints; they must be as the rig file says",
+        "the drives' settings (watchdog, message periods, scales of feed-forward, absolute and"
+        " circular set-points) were not read back, because the rig file names no drives.endpoints;"
+        " they must be as the rig file and the documentation of ODrives say",
     )
 
 

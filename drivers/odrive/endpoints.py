@@ -14,6 +14,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from drivers.odrive.messages import Layouts, read_layouts
 from model.errors import BadInput
 from model.files.reading import read_json
 from model.files.rig_file import OdriveDocument
@@ -110,31 +111,51 @@ class Endpoints:
     by_name: dict[str, Endpoint]
 
 
-def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
-    """Required settings of every drive of a rig; limits are set by separate messages."""
+def wanted_settings(document: OdriveDocument, layouts: Layouts) -> tuple[Wanted, ...]:
+    """Required settings of every drive of a rig; limits are set by separate messages.
+
+    Raises:
+        BadInput: No scale of a drive gives the steps of feed-forward in ``layouts``.
+    """
     can, config, controller = "axis0.config.can", "axis0.config", "axis0.controller.config"
     watchdog = (document.watchdog_ms or 0.0) / 1000.0
+    _, speed_step, torque_step = layouts.set_input_pos.scales
     return (
         Wanted(f"{config}.watchdog_timeout", watchdog, "drives.watchdog_ms"),
         Wanted(f"{config}.enable_watchdog", watchdog > 0.0, "it stops when its master is lost"),
         Wanted(f"{can}.heartbeat_msg_rate_ms", document.heartbeat_ms, "drives.heartbeat_ms"),
         Wanted(f"{can}.encoder_msg_rate_ms", document.estimates_ms, "drives.estimates_ms"),
         Wanted(f"{can}.torques_msg_rate_ms", document.torques_ms, "drives.torques_ms"),
-        Wanted(f"{can}.input_vel_scale", 1000, "feed-forward comes in steps of 0.001 turns/s"),
-        Wanted(f"{can}.input_torque_scale", 1000, "feed-forward comes in steps of 0.001 N·m"),
+        Wanted(f"{can}.input_vel_scale", *_steps_per_unit("Vel_FF", speed_step, document)),
+        Wanted(f"{can}.input_torque_scale", *_steps_per_unit("Torque_FF", torque_step, document)),
         Wanted(f"{controller}.circular_setpoints", False, "cable travel does not wrap around"),
         Wanted(f"{controller}.absolute_setpoints", True, "positions survive a power cycle"),
     )
+
+
+def _steps_per_unit(signal: str, step: float | None, document: OdriveDocument) -> tuple[int, str]:
+    """Scale of feed-forward in the drives' settings, and its reason."""
+    step = 1.0 if step is None else step
+    scale = round(1.0 / step)
+    if scale < 1 or abs(scale * step - 1.0) > 1e-6:
+        raise BadInput(
+            f"Set_Input_Pos.{signal} has steps of {step:g}; an ODrive divides a unit into a whole"
+            " number of steps",
+            where=f"drives.dbc: {document.dbc}",
+            next_step=f"give {signal} a scale such as 0.001, or leave out drives.dbc",
+        )
+    return scale, f"the DBC file gives {signal} steps of {step:g}"
 
 
 def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
     """The endpoints in a `flat_endpoints.json`.
 
     Raises:
-        BadInput: The file cannot be read, has another format, or lacks a required endpoint.
+        BadInput: The file cannot be read, has another format, or lacks a required endpoint, or
+            as for `read_layouts` and `wanted_settings`.
     """
     content = read_json(path, _OTHER_FILE)
-    names = [wanted.name for wanted in wanted_settings(document)]
+    names = [wanted.name for wanted in wanted_settings(document, read_layouts(document.dbc))]
     try:
         file = _EndpointsFile.model_validate(content)
         firmware = _firmware(file.fw_version)

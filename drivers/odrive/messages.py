@@ -168,7 +168,8 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
         if size is None or odd or gap < 0 or signal.byte_order != "little_endian":
             raise _unfit(path, f"{name}.{signal.name} is not a whole number of bytes in order")
         codes += f"{gap}x{size}"
-        scales.append(_scale(signal.conversion.scale, f"{name}.{signal.name}", path))
+        step = _scale(signal.conversion.scale, f"{name}.{signal.name}", path)
+        scales.append(None if step == 1.0 and size != "h" else step)  # feed-forward is a fraction
         end = signal.start + signal.length
     if not end <= message.length * 8 <= 64:
         raise _unfit(
@@ -179,11 +180,11 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
     return Layout(name, message.frame_id, form, tuple(scales))
 
 
-def _scale(given: float, name: str, path: Path) -> float | None:
-    """Value of one step of a signal; None if not scaled."""
+def _scale(given: float, name: str, path: Path) -> float:
+    """Value of one step of a signal."""
     if not 1e-9 <= abs(given) <= 1e9:
         raise _unfit(path, f"{name} has a scale of {str(given)[:40]}")
-    return None if given == 1 else float(given)
+    return float(given)
 
 
 def _unfit(path: Path, what: str) -> BadInput:

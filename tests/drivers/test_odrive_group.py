@@ -19,6 +19,7 @@ from drivers.odrive import configure
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
 from drivers.odrive.messages import (
+    OWN_DBC,
     AxisError,
     AxisState,
     can_id,
@@ -28,6 +29,7 @@ from drivers.odrive.messages import (
 )
 from drivers.odrive.monitor import OdriveMonitor
 from model.errors import BadInput, Fault, HardwareMissing, Refused
+from model.files.rig_file import OdriveDocument
 from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
@@ -40,6 +42,13 @@ WATCHDOG_S = 0.1
 def bench() -> Iterator[OdriveBench]:
     with odrive_bench() as made:
         yield made
+
+
+def odrive_of(rig: Rig) -> OdriveDocument:
+    """The `drives` of a rig."""
+    document = rig.document.drives
+    assert isinstance(document, OdriveDocument)
+    return document
 
 
 def states(bench: OdriveBench) -> set[AxisState]:
@@ -476,6 +485,7 @@ def test_drives_that_are_not_fit_are_refused_before_anything_is_enabled(
 
 def test_without_endpoints_settings_not_read_back_are_reported(bench: OdriveBench) -> None:
     (remark,) = bench.group.configure()
+    assert "scales of feed-forward" in remark
     assert "not read back" in remark
 
 
@@ -489,10 +499,48 @@ def test_settings_are_written_and_read_back_with_the_endpoints_of_the_firmware(
         document: Any = rig.document.drives
         known = read_endpoints(file, document)
         for drive in bench.drives:
-            for wanted in wanted_settings(document):
+            for wanted in wanted_settings(document, read_layouts()):
                 endpoint = known.by_name[wanted.name]
                 raw = drive.settings.values[endpoint.number]
                 assert endpoint.from_raw(raw) == pytest.approx(float(wanted.value))
+
+
+def dbc_with_steps(path: Path, speed: str, torque: str) -> Path:
+    """A DBC file whose feed-forward comes in other steps."""
+    text = OWN_DBC.read_text().replace("48|16@1- (0.001,0)", f"48|16@1- ({torque},0)")
+    path.write_text(text.replace("32|16@1- (0.001,0)", f"32|16@1- ({speed},0)"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("speed", "torque", "scales"),
+    [("0.001", "0.001", (1000, 1000)), ("0.0001", "0.01", (10_000, 100)), ("1", "0.1", (1, 10))],
+)
+def test_drives_scale_feed_forward_as_the_dbc_file_does(
+    tmp_path: Path, speed: str, torque: str, scales: tuple[int, int]
+) -> None:
+    dbc = dbc_with_steps(tmp_path / "steps.dbc", speed, torque)
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    rig = odrive_rig(endpoints=str(file), dbc=str(dbc))
+    known = read_endpoints(file, odrive_of(rig)).by_name
+    with odrive_bench(rig) as bench:
+        bench.group.configure()
+        written = tuple(
+            bench.drives[0].settings.values[known[f"axis0.config.can.input_{kind}_scale"].number]
+            for kind in ("vel", "torque")
+        )
+    assert written == scales
+    packed = read_layouts(dbc).set_input_pos.pack(0.0, 3.0, -2.0)
+    steps = struct.unpack("<hh", packed[4:])
+    assert [step / scale for step, scale in zip(steps, written, strict=True)] == [3.0, -2.0]
+
+
+@pytest.mark.parametrize("step", ["0.0003", "2", "-0.001"])
+def test_steps_that_no_scale_of_a_drive_gives_are_refused(tmp_path: Path, step: str) -> None:
+    dbc = dbc_with_steps(tmp_path / "steps.dbc", step, "0.001")
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with pytest.raises(BadInput, match="Vel_FF"):
+        read_endpoints(file, odrive_of(odrive_rig(dbc=str(dbc))))
 
 
 def test_a_setting_that_is_not_kept_is_refused_with_drive_and_endpoint(tmp_path: Path) -> None:
@@ -545,7 +593,7 @@ def test_a_firmware_without_a_required_setting_is_refused_by_both_names(
     document: Any = odrive_rig().document.drives
     path = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig(), "0.6.3-1")
     content = json.loads(path.read_text())
-    name = wanted_settings(document)[lacking].name
+    name = wanted_settings(document, read_layouts())[lacking].name
     del content["endpoints"][name]
     path.write_text(json.dumps(content))
     with pytest.raises(BadInput) as caught:
