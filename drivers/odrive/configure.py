@@ -156,6 +156,10 @@ TORQUE_RESERVE = 1.2
 WHOLE_IN_FLOAT = 2**24
 """Integers up to this are exact in the 32-bit float of a set-point."""
 
+MOST_CYCLES = 5
+"""Longest period of positions and torques, [cycles]: a position may belong to any set-point since
+the last one, which delays the detection of a drive that does not follow."""
+
 OLDEST_FIRMWARE = (0, 6)
 NO_SUPPLY = 1.0
 """Voltage below which the motor supply is off, [V]."""
@@ -186,6 +190,7 @@ def configure_drives(
     """
     nodes = tuple(winch.node_id for winch in rig.winches)
     check_resolution(rig)
+    check_periods(rig, document)
     known = read_endpoints(Path(document.endpoints), document) if document.endpoints else None
     link = SetupLink(bus, pump, layouts, nodes)
     _check_versions(link, layouts, nodes, known)
@@ -226,6 +231,25 @@ def check_resolution(rig: Rig) -> None:
                 where=f"rig {rig.name}: winches[{drive}]",
                 next_step="choose a smaller counts_per_rev (an arbitrary unit for ODrives), or"
                 " home_counts closer to 0",
+            )
+
+
+def check_periods(rig: Rig, document: OdriveDocument) -> None:
+    """Requires positions and torques often enough for the monitors.
+
+    Raises:
+        BadInput: They are too rare.
+    """
+    limit = MOST_CYCLES * rig.document.bus.cycle_ms
+    for key, setting in (("estimates_ms", "encoder"), ("torques_ms", "torques")):
+        period = getattr(document, key)
+        if period > limit:
+            raise BadInput(
+                f"drives.{key} is {period} ms; the limit is {MOST_CYCLES} cycles, {limit:g} ms",
+                where=f"rig {rig.name}: drives.{key}",
+                why="a drive that does not follow, or a loose cable, would be noticed too late",
+                next_step=f"set {setting}_msg_rate_ms of every drive, and drives.{key}, to the"
+                " cycle",
             )
 
 

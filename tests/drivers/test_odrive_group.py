@@ -244,6 +244,18 @@ def test_messages_at_other_periods_than_the_cycle_are_not_missing() -> None:
             assert status.state is GroupState.ENABLED, status.faults
 
 
+@pytest.mark.parametrize("key", ["estimates_ms", "torques_ms"])
+def test_reports_too_rare_to_see_a_fault_in_time_are_refused(key: str) -> None:
+    """Positions are compared with all set-points of a period: a jammed drive may be any of them."""
+    with odrive_bench(odrive_rig(**{key: 50})) as bench:
+        bench.group.configure()
+    with odrive_bench(odrive_rig(**{key: 51})) as bench:
+        with pytest.raises(BadInput, match=rf"drives\.{key} is 51 ms.*limit.*50 ms") as caught:
+            bench.group.configure()
+        assert not bench.frames()
+    assert "msg_rate_ms" in caught.value.next_step
+
+
 def test_drives_that_report_several_times_a_cycle_follow_without_a_fault() -> None:
     with odrive_bench(odrive_rig(estimates_ms=3)) as bench:
         stood = bench.enable().positions
