@@ -30,6 +30,7 @@ from drivers.can_load import HEARTBEATS_WAITED
 from drivers.drive_group import Pump
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
 from drivers.odrive.messages import (
+    LARGEST_STEPS,
     AxisError,
     AxisState,
     ControlMode,
@@ -190,6 +191,7 @@ def configure_drives(
     """
     nodes = tuple(winch.node_id for winch in rig.winches)
     check_resolution(rig)
+    check_speeds(rig, layouts)
     check_periods(rig, document)
     known = read_endpoints(Path(document.endpoints), document) if document.endpoints else None
     link = SetupLink(bus, pump, layouts, nodes)
@@ -231,6 +233,26 @@ def check_resolution(rig: Rig) -> None:
                 where=f"rig {rig.name}: winches[{drive}]",
                 next_step="choose a smaller counts_per_rev (an arbitrary unit for ODrives), or"
                 " home_counts closer to 0",
+            )
+
+
+def check_speeds(rig: Rig, layouts: Layouts) -> None:
+    """Requires that feed-forward, 16 bits, holds the top speed of every winch.
+
+    Raises:
+        BadInput: It does not.
+    """
+    _, step, _ = layouts.set_input_pos.scales
+    most = LARGEST_STEPS * (step or 1.0)
+    for drive, winch in enumerate(rig.winches):
+        turns = winch.max_speed * abs(winch.counts_per_metre) / winch.counts_per_turn
+        if turns > most:
+            raise BadInput(
+                f"the motor turns at up to {turns:g} turns/s; an ODrive's feed-forward holds"
+                f" {most:g} turns/s",
+                where=f"rig {rig.name}: winches[{drive}]",
+                next_step="lower max_speed_mm_s, or use larger steps: a smaller input_vel_scale of"
+                " the drives, and a drives.dbc with the same steps of Vel_FF",
             )
 
 

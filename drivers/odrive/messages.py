@@ -52,6 +52,9 @@ NEEDED: dict[str, tuple[str, ...]] = {
     "Get_Torques": ("Torque_Target", "Torque_Estimate"),
 }
 
+LARGEST_STEPS = 0x7FFF
+"""Largest value of a scaled signal, [steps]."""
+
 _INTEGERS = {(8, False): "B", (16, False): "H", (32, False): "I", (16, True): "h", (32, True): "i"}
 
 
@@ -86,7 +89,7 @@ class Layout:
 def _steps(value: float, scale: float | None) -> float:
     if scale is None:
         return value
-    return max(-0x8000, min(0x7FFF, round(value / scale)))
+    return max(-0x8000, min(LARGEST_STEPS, round(value / scale)))
 
 
 @dataclass(frozen=True, slots=True)

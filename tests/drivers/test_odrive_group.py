@@ -657,18 +657,41 @@ def test_capabilities_of_the_drives_are_the_rig_files(bench: OdriveBench) -> Non
         assert other.group.capabilities.watchdog_ms is None
 
 
-def with_counts(rig: Rig, counts_per_rev: int) -> Rig:
-    winches = [
-        w.model_copy(update={"counts_per_rev": counts_per_rev}) for w in rig.document.winches
-    ]
+def with_winches(rig: Rig, **changes: float) -> Rig:
+    winches = [w.model_copy(update=changes) for w in rig.document.winches]
     return rig_from_document(rig.document.model_copy(update={"winches": winches}))
 
 
 def test_counts_that_a_float_cannot_resolve_are_refused() -> None:
-    check_resolution(with_counts(odrive_rig(), 100_000))
+    check_resolution(with_winches(odrive_rig(), counts_per_rev=100_000))
     with pytest.raises(BadInput, match="an ODrive's set-point does not resolve") as caught:
-        check_resolution(with_counts(odrive_rig(), 2_000_000))
+        check_resolution(with_winches(odrive_rig(), counts_per_rev=2_000_000))
     assert "counts_per_rev" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("step", "turns_per_s", "refused"),
+    [
+        ("0.001", 32.76, False),
+        ("0.001", 32.78, True),
+        ("0.01", 327.6, False),
+        ("0.01", 327.8, True),
+    ],
+)
+def test_a_speed_beyond_the_feed_forward_is_refused(
+    tmp_path: Path, step: str, turns_per_s: float, refused: bool
+) -> None:
+    dbc = dbc_with_steps(tmp_path / "steps.dbc", step, "0.001")
+    speed = turns_per_s * 206.06 / 50
+    rig = with_winches(odrive_rig(dbc=str(dbc)), gear_ratio=50, max_speed_mm_s=speed)
+    with odrive_bench(rig) as bench:
+        if not refused:
+            bench.group.configure()
+            return
+        with pytest.raises(BadInput, match=rf"{turns_per_s:g} turns/s") as caught:
+            bench.group.configure()
+        assert not bench.frames()
+    assert "max_speed_mm_s" in caught.value.next_step
 
 
 def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
