@@ -308,17 +308,17 @@ def _answers(
 def _check_versions(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], known: Endpoints | None
 ) -> None:
-    """Checks that every drive answers once, with a supported firmware."""
+    """Checks that every drive answers once, with a supported firmware and the known board."""
     for node in nodes:
         link.ask(node, layouts.get_version)
     versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
             raise answers_twice(node)
-    for node, (_, *version) in versions.items():
-        firmware = tuple(int(part) for part in version)
-        text = ".".join(map(str, firmware))
+    for node, (_, *numbers) in versions.items():
+        board, firmware = tuple(map(int, numbers[:3])), tuple(map(int, numbers[3:]))
         if firmware[:2] < OLDEST_FIRMWARE:
+            text = ".".join(map(str, firmware))
             raise Refused(
                 f"its firmware {text} is too old",
                 where=f"drive {node}",
@@ -326,15 +326,24 @@ def _check_versions(
                 next_step="update it with odrivetool",
                 values={"node": node, "firmware": text},
             )
-        if known is not None and firmware != known.firmware:
-            wanted = ".".join(map(str, known.firmware))
-            raise Refused(
-                f"its firmware is {text}, drives.endpoints is for {wanted}",
-                where=f"drive {node}",
-                why="endpoint numbers differ between firmware versions",
-                next_step="use the flat_endpoints.json of the drive's firmware",
-                values={"node": node, "firmware": text},
-            )
+        if known is not None:
+            _require_version(node, "firmware", firmware, known.firmware)
+            _require_version(node, "board", board, known.board)
+
+
+def _require_version(
+    node: int, kind: str, version: tuple[int, ...], described: tuple[int, ...]
+) -> None:
+    """Requires the firmware or board that the file of endpoints describes."""
+    if version != described:
+        text, wanted = (".".join(map(str, numbers)) for numbers in (version, described))
+        raise Refused(
+            f"its {kind} is {text}, drives.endpoints is for {wanted}",
+            where=f"drive {node}",
+            why=f"endpoint numbers differ between {kind} versions",
+            next_step=f"use the flat_endpoints.json of the drive's {kind}",
+            values={"node": node, kind: text},
+        )
 
 
 def _check_idle(

@@ -51,6 +51,7 @@ class _EndpointsFile(BaseModel):
     model_config = ConfigDict(strict=True)
 
     fw_version: Annotated[str, Field(max_length=100)]
+    hw_version: Annotated[str, Field(max_length=100)] = ""
     endpoints: dict[str, object]
 
 
@@ -100,14 +101,16 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """The endpoints of one firmware.
+    """The endpoints of one firmware of one board.
 
     Attributes:
         firmware: Major, minor, revision.
+        board: Product line, version, variant.
         by_name: The endpoints that cdpr uses.
     """
 
     firmware: tuple[int, int, int]
+    board: tuple[int, int, int]
     by_name: dict[str, Endpoint]
 
 
@@ -151,14 +154,15 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
     """The endpoints in a `flat_endpoints.json`.
 
     Raises:
-        BadInput: The file cannot be read, has another format, or lacks a required endpoint, or
-            as for `read_layouts` and `wanted_settings`.
+        BadInput: The file cannot be read, has another format, lacks a required endpoint or its
+            board, or as for `read_layouts` and `wanted_settings`.
     """
     content = read_json(path, _OTHER_FILE)
     names = [wanted.name for wanted in wanted_settings(document, read_layouts(document.dbc))]
     try:
         file = _EndpointsFile.model_validate(content)
-        firmware = _firmware(file.fw_version)
+        firmware = _version("fw_version", file.fw_version, "0.6.11")
+        board = _version("hw_version", file.hw_version, "4.4.58") if file.hw_version else None
         missing = [name for name in names if name not in file.endpoints]
         found = {name: _endpoint(name, file) for name in names if name not in missing}
     except ValueError as error:  # also of pydantic
@@ -171,6 +175,13 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
             where=str(path),
             next_step=_OTHER_FILE,
         ) from error
+    if board is None:
+        raise BadInput(
+            "the file does not state its board: it has no hw_version",
+            where=str(path),
+            why="endpoint numbers differ between boards",
+            next_step=_OTHER_FILE,
+        )
     if missing:
         raise BadInput(
             f"the file lacks required endpoints: {', '.join(missing)}",
@@ -179,14 +190,14 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
             next_step="update the drives' firmware and use its flat_endpoints.json, or leave out"
             " drives.endpoints",
         )
-    return Endpoints(firmware, found)
+    return Endpoints(firmware, board, found)
 
 
-def _firmware(text: str) -> tuple[int, int, int]:
-    """Major, minor and revision of a version such as ``0.6.11-1``."""
+def _version(key: str, text: str, example: str) -> tuple[int, int, int]:
+    """The three numbers of a version such as ``0.6.11-1``."""
     matched = re.match(r"(\d{1,5})\.(\d{1,5})\.(\d{1,5})(?:-|$)", text, re.ASCII)
     if matched is None:
-        raise ValueError(f"fw_version is {text!r}, not a version such as 0.6.11")
+        raise ValueError(f"{key} is {text!r}, not a version such as {example}")
     major, minor, revision = map(int, matched.groups())
     return major, minor, revision
 

@@ -34,6 +34,9 @@ DBC_LIMIT = 2 * MEGABYTE
 NEEDED: dict[str, tuple[str, ...]] = {
     "Get_Version": (
         "Protocol_Version",
+        "Hw_Version_Major",
+        "Hw_Version_Minor",
+        "Hw_Version_Variant",
         "Fw_Version_Major",
         "Fw_Version_Minor",
         "Fw_Version_Revision",

@@ -20,6 +20,7 @@ from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
 from drivers.odrive.messages import (
     OWN_DBC,
+    RXSDO,
     AxisError,
     AxisState,
     can_id,
@@ -573,18 +574,44 @@ def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
             bench.group.configure()
 
 
+def test_endpoints_of_another_board_are_refused_before_any_is_written(tmp_path: Path) -> None:
+    """Their numbers are other settings, which would read back as written."""
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with odrive_bench(odrive_rig(endpoints=str(file))) as bench:
+        bench.drives[7].settings.board = (5, 2, 0)
+        with pytest.raises(Refused, match=r"is 5\.2\.0, drives\.endpoints is for 4\.4\.58") as got:
+            bench.group.configure()
+        commands = {node_and_command(m.arbitration_id)[1] for m in bench.frames()}
+    assert got.value.where == "drive 8"
+    assert "board" in got.value.next_step
+    assert RXSDO not in commands
+
+
+def test_endpoints_of_no_stated_board_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    content = json.loads(file.read_text())
+    del content["hw_version"]
+    file.write_text(json.dumps(content))
+    with pytest.raises(BadInput) as caught:
+        read_endpoints(file, odrive_of(odrive_rig()))
+    assert caught.value.what == "the file does not state its board: it has no hw_version"
+    assert "flat_endpoints.json" in caught.value.next_step
+
+
 @pytest.mark.parametrize(
     "text",
     [
         "",
         "[]",
-        '{"fw_version": "0.6.11", "endpoints": {}}',
-        '{"fw_version": "9e99.6.11", "endpoints": {}}',
-        '{"fw_version": "0.6", "endpoints": {}}',
-        '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout": 3}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints": {}}',
+        '{"fw_version": "9e99.6.11", "hw_version": "4.4.58", "endpoints": {}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4", "endpoints": {}}',
+        '{"fw_version": "0.6", "hw_version": "4.4.58", "endpoints": {}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints":'
+        ' {"axis0.config.watchdog_timeout": 3}}',
         *(
-            '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout":'
-            f' {{"id": {number}, "type": "float"}}}}}}'
+            '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints":'
+            f' {{"axis0.config.watchdog_timeout": {{"id": {number}, "type": "float"}}}}}}'
             for number in ("1e400", "-1", "1.5", "9" * 30, '"x"', "70000")
         ),
     ],
