@@ -59,6 +59,8 @@ RESPONSE_TIMEOUT = 0.5
 ECHO_WAIT = 0.05
 """Time within which a second device with the same node id answers, [s]."""
 
+SENT_CYCLICALLY = "its version_msg_rate_ms is not 0"
+
 OPCODE_READ, OPCODE_WRITE = 0, 1
 
 PUMPED = 0.01
@@ -276,18 +278,32 @@ def check_periods(rig: Rig, document: OdriveDocument) -> None:
 
 
 def _answers(
-    link: SetupLink, layout: Layout, nodes: Sequence[int], timeout: float, *, asked: bool
+    link: SetupLink,
+    layout: Layout,
+    nodes: Sequence[int],
+    timeout: float,
+    *,
+    asked: bool,
+    once: bool = False,
 ) -> Answers:
     """One message from every drive.
 
+    Args:
+        link: The bus.
+        layout: Of the message.
+        nodes: The drives.
+        timeout: Time for all of them, [s].
+        asked: The message was requested; otherwise drives send it on their own.
+        once: No drive may send it twice.
+
     Raises:
         HardwareMissing: A drive sent none.
-        Refused: A request was answered twice.
+        Refused: A drive sent two.
     """
     received: Answers = {}
     for node, values in link.answers(layout, timeout):
-        if node in received and asked:
-            raise answers_twice(node)
+        if node in received and once:
+            raise answers_twice(node, SENT_CYCLICALLY)
         if node in nodes:
             received[node] = values
         if len(received) == len(nodes):
@@ -311,10 +327,10 @@ def _check_versions(
     """Checks that every drive answers once, with a supported firmware and the known board."""
     for node in nodes:
         link.ask(node, layouts.get_version)
-    versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
+    versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True, once=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
-            raise answers_twice(node)
+            raise answers_twice(node, SENT_CYCLICALLY)
     for node, (_, *numbers) in versions.items():
         board, firmware = tuple(map(int, numbers[:3])), tuple(map(int, numbers[3:]))
         if firmware[:2] < OLDEST_FIRMWARE:

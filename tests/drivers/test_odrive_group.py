@@ -455,6 +455,31 @@ class OdriveRehearsalTwin:
         self._receive(command, data)
 
 
+@pytest.mark.parametrize("drive", [0, 7])
+def test_a_drive_that_also_reports_its_supply_on_its_own_is_no_second_device(
+    bench: OdriveBench, drive: int
+) -> None:
+    """Its bus_voltage_msg_rate_ms may be set; the first drive to answer is the likelier one."""
+    pump = bench.rehearsal.pump
+
+    def with_reports() -> None:
+        pump()
+        bench.drives[drive].receive(0x17, b"")
+
+    bench.group._pump = with_reports
+    assert bench.group.configure()
+    assert bench.group.state is GroupState.CONFIGURED
+
+
+def test_a_drive_that_reports_its_version_on_its_own_is_refused_by_that_setting(
+    bench: OdriveBench,
+) -> None:
+    _twin(bench)
+    with pytest.raises(Refused) as caught:
+        bench.group.configure()
+    assert "version_msg_rate_ms is not 0" in caught.value.why
+
+
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
     "silent": (lambda b: setattr(b.drives[1], "deaf", True), HardwareMissing, "drive 2: no"),
     "no heartbeat": (
