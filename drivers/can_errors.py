@@ -301,12 +301,13 @@ class TorqueLost(Refused):
         )
 
 
-def answers_twice(node: int) -> Refused:
-    """Two devices have the same node id."""
+def answers_twice(node: int, otherwise: str = "") -> Refused:
+    """Two devices have the same node id; ``otherwise`` is a further possible cause."""
     return Refused(
         f"drive {node} answered twice",
         where=SETTING_UP,
-        why="two devices have this node id, or `cdpr sim` was started twice",
+        why="two devices have this node id, or `cdpr sim` was started twice"
+        + (f", or {otherwise}" if otherwise else ""),
         next_step="give each device on the bus a unique node id",
         values={"node": node},
     )

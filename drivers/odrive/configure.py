@@ -30,6 +30,7 @@ from drivers.can_load import HEARTBEATS_WAITED
 from drivers.drive_group import Pump
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
 from drivers.odrive.messages import (
+    LARGEST_STEPS,
     AxisError,
     AxisState,
     ControlMode,
@@ -57,6 +58,8 @@ RESPONSE_TIMEOUT = 0.5
 
 ECHO_WAIT = 0.05
 """Time within which a second device with the same node id answers, [s]."""
+
+SENT_CYCLICALLY = "its version_msg_rate_ms is not 0"
 
 OPCODE_READ, OPCODE_WRITE = 0, 1
 
@@ -156,6 +159,10 @@ TORQUE_RESERVE = 1.2
 WHOLE_IN_FLOAT = 2**24
 """Integers up to this are exact in the 32-bit float of a set-point."""
 
+MOST_CYCLES = 5
+"""Longest period of positions and torques, [cycles]: a position may belong to any set-point since
+the last one, which delays the detection of a drive that does not follow."""
+
 OLDEST_FIRMWARE = (0, 6)
 NO_SUPPLY = 1.0
 """Voltage below which the motor supply is off, [V]."""
@@ -186,6 +193,8 @@ def configure_drives(
     """
     nodes = tuple(winch.node_id for winch in rig.winches)
     check_resolution(rig)
+    check_speeds(rig, layouts)
+    check_periods(rig, document)
     known = read_endpoints(Path(document.endpoints), document) if document.endpoints else None
     link = SetupLink(bus, pump, layouts, nodes)
     _check_versions(link, layouts, nodes, known)
@@ -193,7 +202,7 @@ def configure_drives(
     _check_supply(link, layouts, nodes)
     if known is not None:
         for node in nodes:
-            for wanted in wanted_settings(document):
+            for wanted in wanted_settings(document, layouts):
                 _set(link, layouts, node, known.by_name[wanted.name], wanted)
     for winch in rig.winches:
         turns = SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
@@ -205,8 +214,9 @@ def configure_drives(
     if known is not None:
         return ()
     return (
-        "the drives' watchdog and message periods were not read back, because the rig file names"
-        " no drives.endpoints; they must be as the rig file says",
+        "the drives' settings (watchdog, message periods, scales of feed-forward, absolute and"
+        " circular set-points) were not read back, because the rig file names no drives.endpoints;"
+        " they must be as the rig file and the documentation of ODrives say",
     )
 
 
@@ -228,19 +238,72 @@ def check_resolution(rig: Rig) -> None:
             )
 
 
+def check_speeds(rig: Rig, layouts: Layouts) -> None:
+    """Requires that feed-forward, 16 bits, holds the top speed of every winch.
+
+    Raises:
+        BadInput: It does not.
+    """
+    _, step, _ = layouts.set_input_pos.scales
+    most = LARGEST_STEPS * (step or 1.0)
+    for drive, winch in enumerate(rig.winches):
+        turns = winch.max_speed * abs(winch.counts_per_metre) / winch.counts_per_turn
+        if turns > most:
+            raise BadInput(
+                f"the motor turns at up to {turns:g} turns/s; an ODrive's feed-forward holds"
+                f" {most:g} turns/s",
+                where=f"rig {rig.name}: winches[{drive}]",
+                next_step="lower max_speed_mm_s, or use larger steps: a smaller input_vel_scale of"
+                " the drives, and a drives.dbc with the same steps of Vel_FF",
+            )
+
+
+def check_periods(rig: Rig, document: OdriveDocument) -> None:
+    """Requires positions and torques often enough for the monitors.
+
+    Raises:
+        BadInput: They are too rare.
+    """
+    limit = MOST_CYCLES * rig.document.bus.cycle_ms
+    for key, setting in (("estimates_ms", "encoder"), ("torques_ms", "torques")):
+        period = getattr(document, key)
+        if period > limit:
+            raise BadInput(
+                f"drives.{key} is {period} ms; the limit is {MOST_CYCLES} cycles, {limit:g} ms",
+                where=f"rig {rig.name}: drives.{key}",
+                why="a drive that does not follow, or a loose cable, would be noticed too late",
+                next_step=f"set {setting}_msg_rate_ms of every drive, and drives.{key}, to the"
+                " cycle",
+            )
+
+
 def _answers(
-    link: SetupLink, layout: Layout, nodes: Sequence[int], timeout: float, *, asked: bool
+    link: SetupLink,
+    layout: Layout,
+    nodes: Sequence[int],
+    timeout: float,
+    *,
+    asked: bool,
+    once: bool = False,
 ) -> Answers:
     """One message from every drive.
 
+    Args:
+        link: The bus.
+        layout: Of the message.
+        nodes: The drives.
+        timeout: Time for all of them, [s].
+        asked: The message was requested; otherwise drives send it on their own.
+        once: No drive may send it twice.
+
     Raises:
         HardwareMissing: A drive sent none.
-        Refused: A request was answered twice.
+        Refused: A drive sent two.
     """
     received: Answers = {}
     for node, values in link.answers(layout, timeout):
-        if node in received and asked:
-            raise answers_twice(node)
+        if node in received and once:
+            raise answers_twice(node, SENT_CYCLICALLY)
         if node in nodes:
             received[node] = values
         if len(received) == len(nodes):
@@ -261,17 +324,17 @@ def _answers(
 def _check_versions(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], known: Endpoints | None
 ) -> None:
-    """Checks that every drive answers once, with a supported firmware."""
+    """Checks that every drive answers once, with a supported firmware and the known board."""
     for node in nodes:
         link.ask(node, layouts.get_version)
-    versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True)
+    versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True, once=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
-            raise answers_twice(node)
-    for node, (_, *version) in versions.items():
-        firmware = tuple(int(part) for part in version)
-        text = ".".join(map(str, firmware))
+            raise answers_twice(node, SENT_CYCLICALLY)
+    for node, (_, *numbers) in versions.items():
+        board, firmware = tuple(map(int, numbers[:3])), tuple(map(int, numbers[3:]))
         if firmware[:2] < OLDEST_FIRMWARE:
+            text = ".".join(map(str, firmware))
             raise Refused(
                 f"its firmware {text} is too old",
                 where=f"drive {node}",
@@ -279,15 +342,24 @@ def _check_versions(
                 next_step="update it with odrivetool",
                 values={"node": node, "firmware": text},
             )
-        if known is not None and firmware != known.firmware:
-            wanted = ".".join(map(str, known.firmware))
-            raise Refused(
-                f"its firmware is {text}, drives.endpoints is for {wanted}",
-                where=f"drive {node}",
-                why="endpoint numbers differ between firmware versions",
-                next_step="use the flat_endpoints.json of the drive's firmware",
-                values={"node": node, "firmware": text},
-            )
+        if known is not None:
+            _require_version(node, "firmware", firmware, known.firmware)
+            _require_version(node, "board", board, known.board)
+
+
+def _require_version(
+    node: int, kind: str, version: tuple[int, ...], described: tuple[int, ...]
+) -> None:
+    """Requires the firmware or board that the file of endpoints describes."""
+    if version != described:
+        text, wanted = (".".join(map(str, numbers)) for numbers in (version, described))
+        raise Refused(
+            f"its {kind} is {text}, drives.endpoints is for {wanted}",
+            where=f"drive {node}",
+            why=f"endpoint numbers differ between {kind} versions",
+            next_step=f"use the flat_endpoints.json of the drive's {kind}",
+            values={"node": node, kind: text},
+        )
 
 
 def _check_idle(

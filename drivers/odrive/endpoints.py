@@ -14,6 +14,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from drivers.odrive.messages import Layouts, read_layouts
 from model.errors import BadInput
 from model.files.reading import read_json
 from model.files.rig_file import OdriveDocument
@@ -50,6 +51,7 @@ class _EndpointsFile(BaseModel):
     model_config = ConfigDict(strict=True)
 
     fw_version: Annotated[str, Field(max_length=100)]
+    hw_version: Annotated[str, Field(max_length=100)] = ""
     endpoints: dict[str, object]
 
 
@@ -99,45 +101,68 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Endpoints:
-    """The endpoints of one firmware.
+    """The endpoints of one firmware of one board.
 
     Attributes:
         firmware: Major, minor, revision.
+        board: Product line, version, variant.
         by_name: The endpoints that cdpr uses.
     """
 
     firmware: tuple[int, int, int]
+    board: tuple[int, int, int]
     by_name: dict[str, Endpoint]
 
 
-def wanted_settings(document: OdriveDocument) -> tuple[Wanted, ...]:
-    """Required settings of every drive of a rig; limits are set by separate messages."""
+def wanted_settings(document: OdriveDocument, layouts: Layouts) -> tuple[Wanted, ...]:
+    """Required settings of every drive of a rig; limits are set by separate messages.
+
+    Raises:
+        BadInput: No scale of a drive gives the steps of feed-forward in ``layouts``.
+    """
     can, config, controller = "axis0.config.can", "axis0.config", "axis0.controller.config"
     watchdog = (document.watchdog_ms or 0.0) / 1000.0
+    _, speed_step, torque_step = layouts.set_input_pos.scales
     return (
         Wanted(f"{config}.watchdog_timeout", watchdog, "drives.watchdog_ms"),
         Wanted(f"{config}.enable_watchdog", watchdog > 0.0, "it stops when its master is lost"),
         Wanted(f"{can}.heartbeat_msg_rate_ms", document.heartbeat_ms, "drives.heartbeat_ms"),
         Wanted(f"{can}.encoder_msg_rate_ms", document.estimates_ms, "drives.estimates_ms"),
         Wanted(f"{can}.torques_msg_rate_ms", document.torques_ms, "drives.torques_ms"),
-        Wanted(f"{can}.input_vel_scale", 1000, "feed-forward comes in steps of 0.001 turns/s"),
-        Wanted(f"{can}.input_torque_scale", 1000, "feed-forward comes in steps of 0.001 N·m"),
+        Wanted(f"{can}.input_vel_scale", *_steps_per_unit("Vel_FF", speed_step, document)),
+        Wanted(f"{can}.input_torque_scale", *_steps_per_unit("Torque_FF", torque_step, document)),
         Wanted(f"{controller}.circular_setpoints", False, "cable travel does not wrap around"),
         Wanted(f"{controller}.absolute_setpoints", True, "positions survive a power cycle"),
     )
+
+
+def _steps_per_unit(signal: str, step: float | None, document: OdriveDocument) -> tuple[int, str]:
+    """Scale of feed-forward in the drives' settings, and its reason."""
+    step = 1.0 if step is None else step
+    scale = round(1.0 / step)
+    if scale < 1 or abs(scale * step - 1.0) > 1e-6:
+        raise BadInput(
+            f"Set_Input_Pos.{signal} has steps of {step:g}; an ODrive divides a unit into a whole"
+            " number of steps",
+            where=f"drives.dbc: {document.dbc}",
+            next_step=f"give {signal} a scale such as 0.001, or leave out drives.dbc",
+        )
+    return scale, f"the DBC file gives {signal} steps of {step:g}"
 
 
 def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
     """The endpoints in a `flat_endpoints.json`.
 
     Raises:
-        BadInput: The file cannot be read, has another format, or lacks a required endpoint.
+        BadInput: The file cannot be read, has another format, lacks a required endpoint or its
+            board, or as for `read_layouts` and `wanted_settings`.
     """
     content = read_json(path, _OTHER_FILE)
-    names = [wanted.name for wanted in wanted_settings(document)]
+    names = [wanted.name for wanted in wanted_settings(document, read_layouts(document.dbc))]
     try:
         file = _EndpointsFile.model_validate(content)
-        firmware = _firmware(file.fw_version)
+        firmware = _version("fw_version", file.fw_version, "0.6.11")
+        board = _version("hw_version", file.hw_version, "4.4.58") if file.hw_version else None
         missing = [name for name in names if name not in file.endpoints]
         found = {name: _endpoint(name, file) for name in names if name not in missing}
     except ValueError as error:  # also of pydantic
@@ -150,6 +175,13 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
             where=str(path),
             next_step=_OTHER_FILE,
         ) from error
+    if board is None:
+        raise BadInput(
+            "the file does not state its board: it has no hw_version",
+            where=str(path),
+            why="endpoint numbers differ between boards",
+            next_step=_OTHER_FILE,
+        )
     if missing:
         raise BadInput(
             f"the file lacks required endpoints: {', '.join(missing)}",
@@ -158,14 +190,14 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
             next_step="update the drives' firmware and use its flat_endpoints.json, or leave out"
             " drives.endpoints",
         )
-    return Endpoints(firmware, found)
+    return Endpoints(firmware, board, found)
 
 
-def _firmware(text: str) -> tuple[int, int, int]:
-    """Major, minor and revision of a version such as ``0.6.11-1``."""
+def _version(key: str, text: str, example: str) -> tuple[int, int, int]:
+    """The three numbers of a version such as ``0.6.11-1``."""
     matched = re.match(r"(\d{1,5})\.(\d{1,5})\.(\d{1,5})(?:-|$)", text, re.ASCII)
     if matched is None:
-        raise ValueError(f"fw_version is {text!r}, not a version such as 0.6.11")
+        raise ValueError(f"{key} is {text!r}, not a version such as {example}")
     major, minor, revision = map(int, matched.groups())
     return major, minor, revision
 

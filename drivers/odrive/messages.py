@@ -34,6 +34,9 @@ DBC_LIMIT = 2 * MEGABYTE
 NEEDED: dict[str, tuple[str, ...]] = {
     "Get_Version": (
         "Protocol_Version",
+        "Hw_Version_Major",
+        "Hw_Version_Minor",
+        "Hw_Version_Variant",
         "Fw_Version_Major",
         "Fw_Version_Minor",
         "Fw_Version_Revision",
@@ -51,6 +54,9 @@ NEEDED: dict[str, tuple[str, ...]] = {
     "Clear_Errors": ("Identify",),
     "Get_Torques": ("Torque_Target", "Torque_Estimate"),
 }
+
+LARGEST_STEPS = 0x7FFF
+"""Largest value of a scaled signal, [steps]."""
 
 _INTEGERS = {(8, False): "B", (16, False): "H", (32, False): "I", (16, True): "h", (32, True): "i"}
 
@@ -86,7 +92,7 @@ class Layout:
 def _steps(value: float, scale: float | None) -> float:
     if scale is None:
         return value
-    return max(-0x8000, min(0x7FFF, round(value / scale)))
+    return max(-0x8000, min(LARGEST_STEPS, round(value / scale)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +174,8 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
         if size is None or odd or gap < 0 or signal.byte_order != "little_endian":
             raise _unfit(path, f"{name}.{signal.name} is not a whole number of bytes in order")
         codes += f"{gap}x{size}"
-        scales.append(_scale(signal.conversion.scale, f"{name}.{signal.name}", path))
+        step = _scale(signal.conversion.scale, f"{name}.{signal.name}", path)
+        scales.append(None if step == 1.0 and size != "h" else step)  # feed-forward is a fraction
         end = signal.start + signal.length
     if not end <= message.length * 8 <= 64:
         raise _unfit(
@@ -179,11 +186,11 @@ def _layout(database: Any, name: str, path: Path) -> Layout:
     return Layout(name, message.frame_id, form, tuple(scales))
 
 
-def _scale(given: float, name: str, path: Path) -> float | None:
-    """Value of one step of a signal; None if not scaled."""
+def _scale(given: float, name: str, path: Path) -> float:
+    """Value of one step of a signal."""
     if not 1e-9 <= abs(given) <= 1e9:
         raise _unfit(path, f"{name} has a scale of {str(given)[:40]}")
-    return None if given == 1 else float(given)
+    return float(given)
 
 
 def _unfit(path: Path, what: str) -> BadInput:

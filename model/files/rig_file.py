@@ -81,7 +81,8 @@ class OdriveDocument(Document):
     )
     endpoints: FileName | None = Field(
         default=None,
-        description="flat_endpoints.json of the firmware; settings are read back only with it",
+        description="flat_endpoints.json of firmware and board; settings are read back only with"
+        " it",
     )
 
 

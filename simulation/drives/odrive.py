@@ -62,6 +62,7 @@ class OdriveSettings:
         torques: Period, [s].
         watchdog_at_rest: The watchdog also runs while the axis is idle, as in firmware 0.5.
         firmware: Major, minor, revision.
+        board: Product line, version, variant.
         values: Other endpoints by number, as four raw bytes.
         stuck: Endpoints that ignore writes (set by tests).
     """
@@ -72,6 +73,7 @@ class OdriveSettings:
     torques: float
     watchdog_at_rest: bool = False
     firmware: tuple[int, int, int] = (0, 6, 11)
+    board: tuple[int, int, int] = (4, 4, 58)
     values: dict[int, int] = field(default_factory=dict)
     stuck: set[int] = field(default_factory=set)
 
@@ -233,7 +235,7 @@ class SimulatedOdrive:
         if command == self._layouts.estop.command:  # the only command without data
             self._estop()
         elif command == self._layouts.get_version.command:
-            self._send(self._layouts.get_version, 2, *self.settings.firmware)
+            self._send(self._layouts.get_version, 2, *self.settings.board, *self.settings.firmware)
         elif command == self._layouts.get_bus_voltage_current.command:
             self._send(self._layouts.get_bus_voltage_current, self.supply, 0.0)
 
@@ -348,5 +350,6 @@ def _settings(document: OdriveDocument) -> OdriveSettings:
         torques=document.torques_ms / 1000.0,
     )
     if document.endpoints is not None:
-        settings.firmware = read_endpoints(Path(document.endpoints), document).firmware
+        known = read_endpoints(Path(document.endpoints), document)
+        settings.firmware, settings.board = known.firmware, known.board
     return settings

@@ -16,6 +16,7 @@ from drivers.can_bus import BusSettings, InProcessBus, open_bus
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.odrive.endpoints import wanted_settings
 from drivers.odrive.group import OdriveGroup
+from drivers.odrive.messages import read_layouts
 from model.rig import Rig, load_rig, rig_from_document
 from simulation.drives.odrive import SimulatedOdrive, SimulatedOdriveRig
 
@@ -36,7 +37,8 @@ def write_endpoints(path: Path, rig: Rig, firmware: str = "0.6.11") -> Path:
     """A file in the form of ODrive's flat_endpoints.json."""
     document: Any = rig.document.drives
     types = {bool: "bool", int: "uint32", float: "float"}
-    names = {w.name: types[type(w.value)] for w in wanted_settings(document)}
+    wanted = wanted_settings(document, read_layouts(document.dbc))
+    names = {w.name: types[type(w.value)] for w in wanted}
     endpoints = {
         name: {"id": 200 + i, "type": kind} for i, (name, kind) in enumerate(names.items())
     }

@@ -36,7 +36,7 @@ def own() -> Layouts:
 @pytest.mark.parametrize(
     ("name", "command", "values", "data"),
     [
-        ("get_version", 0x00, (2, 0, 6, 11), "02 000000 00 06 0b 00"),
+        ("get_version", 0x00, (2, 4, 4, 58, 0, 6, 11), "02 04043a 00 06 0b 00"),
         ("heartbeat", 0x01, (0x01000000, 8, 3), "00000001 08 03 00 00"),
         ("estop", 0x02, (), ""),
         ("rxsdo", 0x04, (1, 0x0123, 7), "01 2301 00 07000000"),

@@ -19,6 +19,8 @@ from drivers.odrive import configure
 from drivers.odrive.configure import check_resolution
 from drivers.odrive.endpoints import read_endpoints, wanted_settings
 from drivers.odrive.messages import (
+    OWN_DBC,
+    RXSDO,
     AxisError,
     AxisState,
     can_id,
@@ -28,6 +30,7 @@ from drivers.odrive.messages import (
 )
 from drivers.odrive.monitor import OdriveMonitor
 from model.errors import BadInput, Fault, HardwareMissing, Refused
+from model.files.rig_file import OdriveDocument
 from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
@@ -40,6 +43,13 @@ WATCHDOG_S = 0.1
 def bench() -> Iterator[OdriveBench]:
     with odrive_bench() as made:
         yield made
+
+
+def odrive_of(rig: Rig) -> OdriveDocument:
+    """The `drives` of a rig."""
+    document = rig.document.drives
+    assert isinstance(document, OdriveDocument)
+    return document
 
 
 def states(bench: OdriveBench) -> set[AxisState]:
@@ -233,6 +243,18 @@ def test_messages_at_other_periods_than_the_cycle_are_not_missing() -> None:
             status = bench.cycle()
             assert not status.missing.any()
             assert status.state is GroupState.ENABLED, status.faults
+
+
+@pytest.mark.parametrize("key", ["estimates_ms", "torques_ms"])
+def test_reports_too_rare_to_see_a_fault_in_time_are_refused(key: str) -> None:
+    """Positions are compared with all set-points of a period: a jammed drive may be any of them."""
+    with odrive_bench(odrive_rig(**{key: 50})) as bench:
+        bench.group.configure()
+    with odrive_bench(odrive_rig(**{key: 51})) as bench:
+        with pytest.raises(BadInput, match=rf"drives\.{key} is 51 ms.*limit.*50 ms") as caught:
+            bench.group.configure()
+        assert not bench.frames()
+    assert "msg_rate_ms" in caught.value.next_step
 
 
 def test_drives_that_report_several_times_a_cycle_follow_without_a_fault() -> None:
@@ -433,6 +455,31 @@ class OdriveRehearsalTwin:
         self._receive(command, data)
 
 
+@pytest.mark.parametrize("drive", [0, 7])
+def test_a_drive_that_also_reports_its_supply_on_its_own_is_no_second_device(
+    bench: OdriveBench, drive: int
+) -> None:
+    """Its bus_voltage_msg_rate_ms may be set; the first drive to answer is the likelier one."""
+    pump = bench.rehearsal.pump
+
+    def with_reports() -> None:
+        pump()
+        bench.drives[drive].receive(0x17, b"")
+
+    bench.group._pump = with_reports
+    assert bench.group.configure()
+    assert bench.group.state is GroupState.CONFIGURED
+
+
+def test_a_drive_that_reports_its_version_on_its_own_is_refused_by_that_setting(
+    bench: OdriveBench,
+) -> None:
+    _twin(bench)
+    with pytest.raises(Refused) as caught:
+        bench.group.configure()
+    assert "version_msg_rate_ms is not 0" in caught.value.why
+
+
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
     "silent": (lambda b: setattr(b.drives[1], "deaf", True), HardwareMissing, "drive 2: no"),
     "no heartbeat": (
@@ -476,6 +523,7 @@ def test_drives_that_are_not_fit_are_refused_before_anything_is_enabled(
 
 def test_without_endpoints_settings_not_read_back_are_reported(bench: OdriveBench) -> None:
     (remark,) = bench.group.configure()
+    assert "scales of feed-forward" in remark
     assert "not read back" in remark
 
 
@@ -489,10 +537,48 @@ def test_settings_are_written_and_read_back_with_the_endpoints_of_the_firmware(
         document: Any = rig.document.drives
         known = read_endpoints(file, document)
         for drive in bench.drives:
-            for wanted in wanted_settings(document):
+            for wanted in wanted_settings(document, read_layouts()):
                 endpoint = known.by_name[wanted.name]
                 raw = drive.settings.values[endpoint.number]
                 assert endpoint.from_raw(raw) == pytest.approx(float(wanted.value))
+
+
+def dbc_with_steps(path: Path, speed: str, torque: str) -> Path:
+    """A DBC file whose feed-forward comes in other steps."""
+    text = OWN_DBC.read_text().replace("48|16@1- (0.001,0)", f"48|16@1- ({torque},0)")
+    path.write_text(text.replace("32|16@1- (0.001,0)", f"32|16@1- ({speed},0)"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("speed", "torque", "scales"),
+    [("0.001", "0.001", (1000, 1000)), ("0.0001", "0.01", (10_000, 100)), ("1", "0.1", (1, 10))],
+)
+def test_drives_scale_feed_forward_as_the_dbc_file_does(
+    tmp_path: Path, speed: str, torque: str, scales: tuple[int, int]
+) -> None:
+    dbc = dbc_with_steps(tmp_path / "steps.dbc", speed, torque)
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    rig = odrive_rig(endpoints=str(file), dbc=str(dbc))
+    known = read_endpoints(file, odrive_of(rig)).by_name
+    with odrive_bench(rig) as bench:
+        bench.group.configure()
+        written = tuple(
+            bench.drives[0].settings.values[known[f"axis0.config.can.input_{kind}_scale"].number]
+            for kind in ("vel", "torque")
+        )
+    assert written == scales
+    packed = read_layouts(dbc).set_input_pos.pack(0.0, 3.0, -2.0)
+    steps = struct.unpack("<hh", packed[4:])
+    assert [step / scale for step, scale in zip(steps, written, strict=True)] == [3.0, -2.0]
+
+
+@pytest.mark.parametrize("step", ["0.0003", "2", "-0.001"])
+def test_steps_that_no_scale_of_a_drive_gives_are_refused(tmp_path: Path, step: str) -> None:
+    dbc = dbc_with_steps(tmp_path / "steps.dbc", step, "0.001")
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with pytest.raises(BadInput, match="Vel_FF"):
+        read_endpoints(file, odrive_of(odrive_rig(dbc=str(dbc))))
 
 
 def test_a_setting_that_is_not_kept_is_refused_with_drive_and_endpoint(tmp_path: Path) -> None:
@@ -513,18 +599,44 @@ def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
             bench.group.configure()
 
 
+def test_endpoints_of_another_board_are_refused_before_any_is_written(tmp_path: Path) -> None:
+    """Their numbers are other settings, which would read back as written."""
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with odrive_bench(odrive_rig(endpoints=str(file))) as bench:
+        bench.drives[7].settings.board = (5, 2, 0)
+        with pytest.raises(Refused, match=r"is 5\.2\.0, drives\.endpoints is for 4\.4\.58") as got:
+            bench.group.configure()
+        commands = {node_and_command(m.arbitration_id)[1] for m in bench.frames()}
+    assert got.value.where == "drive 8"
+    assert "board" in got.value.next_step
+    assert RXSDO not in commands
+
+
+def test_endpoints_of_no_stated_board_are_refused_in_one_sentence(tmp_path: Path) -> None:
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    content = json.loads(file.read_text())
+    del content["hw_version"]
+    file.write_text(json.dumps(content))
+    with pytest.raises(BadInput) as caught:
+        read_endpoints(file, odrive_of(odrive_rig()))
+    assert caught.value.what == "the file does not state its board: it has no hw_version"
+    assert "flat_endpoints.json" in caught.value.next_step
+
+
 @pytest.mark.parametrize(
     "text",
     [
         "",
         "[]",
-        '{"fw_version": "0.6.11", "endpoints": {}}',
-        '{"fw_version": "9e99.6.11", "endpoints": {}}',
-        '{"fw_version": "0.6", "endpoints": {}}',
-        '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout": 3}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints": {}}',
+        '{"fw_version": "9e99.6.11", "hw_version": "4.4.58", "endpoints": {}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4", "endpoints": {}}',
+        '{"fw_version": "0.6", "hw_version": "4.4.58", "endpoints": {}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints":'
+        ' {"axis0.config.watchdog_timeout": 3}}',
         *(
-            '{"fw_version": "0.6.11", "endpoints": {"axis0.config.watchdog_timeout":'
-            f' {{"id": {number}, "type": "float"}}}}}}'
+            '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints":'
+            f' {{"axis0.config.watchdog_timeout": {{"id": {number}, "type": "float"}}}}}}'
             for number in ("1e400", "-1", "1.5", "9" * 30, '"x"', "70000")
         ),
     ],
@@ -545,7 +657,7 @@ def test_a_firmware_without_a_required_setting_is_refused_by_both_names(
     document: Any = odrive_rig().document.drives
     path = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig(), "0.6.3-1")
     content = json.loads(path.read_text())
-    name = wanted_settings(document)[lacking].name
+    name = wanted_settings(document, read_layouts())[lacking].name
     del content["endpoints"][name]
     path.write_text(json.dumps(content))
     with pytest.raises(BadInput) as caught:
@@ -597,18 +709,41 @@ def test_capabilities_of_the_drives_are_the_rig_files(bench: OdriveBench) -> Non
         assert other.group.capabilities.watchdog_ms is None
 
 
-def with_counts(rig: Rig, counts_per_rev: int) -> Rig:
-    winches = [
-        w.model_copy(update={"counts_per_rev": counts_per_rev}) for w in rig.document.winches
-    ]
+def with_winches(rig: Rig, **changes: float) -> Rig:
+    winches = [w.model_copy(update=changes) for w in rig.document.winches]
     return rig_from_document(rig.document.model_copy(update={"winches": winches}))
 
 
 def test_counts_that_a_float_cannot_resolve_are_refused() -> None:
-    check_resolution(with_counts(odrive_rig(), 100_000))
+    check_resolution(with_winches(odrive_rig(), counts_per_rev=100_000))
     with pytest.raises(BadInput, match="an ODrive's set-point does not resolve") as caught:
-        check_resolution(with_counts(odrive_rig(), 2_000_000))
+        check_resolution(with_winches(odrive_rig(), counts_per_rev=2_000_000))
     assert "counts_per_rev" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("step", "turns_per_s", "refused"),
+    [
+        ("0.001", 32.76, False),
+        ("0.001", 32.78, True),
+        ("0.01", 327.6, False),
+        ("0.01", 327.8, True),
+    ],
+)
+def test_a_speed_beyond_the_feed_forward_is_refused(
+    tmp_path: Path, step: str, turns_per_s: float, refused: bool
+) -> None:
+    dbc = dbc_with_steps(tmp_path / "steps.dbc", step, "0.001")
+    speed = turns_per_s * 206.06 / 50
+    rig = with_winches(odrive_rig(dbc=str(dbc)), gear_ratio=50, max_speed_mm_s=speed)
+    with odrive_bench(rig) as bench:
+        if not refused:
+            bench.group.configure()
+            return
+        with pytest.raises(BadInput, match=rf"{turns_per_s:g} turns/s") as caught:
+            bench.group.configure()
+        assert not bench.frames()
+    assert "max_speed_mm_s" in caught.value.next_step
 
 
 def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:

@@ -123,12 +123,14 @@ def _pictures(folder: Path) -> None:
 
 def _endpoints(path: Path) -> None:
     from drivers.odrive.endpoints import wanted_settings
+    from drivers.odrive.messages import read_layouts
     from model.files.rig_file import OdriveDocument
 
     document = OdriveDocument(type="odrive", motor_torque_constant_nm_a=0.05, watchdog_ms=50.0)
-    names = [wanted.name for wanted in wanted_settings(document)]
+    names = [wanted.name for wanted in wanted_settings(document, read_layouts())]
     endpoints = {name: {"id": i, "type": "float"} for i, name in enumerate(names, 100)}
-    path.write_text(json.dumps({"fw_version": "0.6.10-0", "endpoints": endpoints}, indent=1))
+    versions = {"fw_version": "0.6.10-0", "hw_version": "4.4.58"}
+    path.write_text(json.dumps({**versions, "endpoints": endpoints}, indent=1))
 
 
 def _video(path: Path) -> None:
