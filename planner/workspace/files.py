@@ -68,8 +68,7 @@ def write_maps(
 def _lead(question: Question) -> str:
     """First sentence of the page."""
     rig = question.rig
-    load = None if question.scene is None else question.scene.load
-    reserve = margin_reserve(rig, load, turns=False)
+    reserve = max(margin_reserve(rig, load, turns=False) for load in question.loads)
     rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
