@@ -27,7 +27,17 @@ from planner.workspace.figures import (
     write_figures,
 )
 from planner.workspace.maps import Question
-from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
+from planner.workspace.report import (
+    ABOUT,
+    Chapter,
+    about_of,
+    about_text,
+    arrays_of,
+    csv_of,
+    page,
+    shown_in,
+    summary_of,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -47,7 +57,7 @@ _LEVELS_OF = (
 def write_maps(
     folder: Path, made: list[Maps], question: Question, scene: Scene | None = None
 ) -> dict[str, Any]:
-    """Writes all files and returns the summaries by name of grid.
+    """Writes all files and returns the summaries by name of grid, after what they are about.
 
     Args:
         folder: An existing folder.
@@ -59,8 +69,10 @@ def write_maps(
     where = f" in {scene.name}" if scene else ""
     title = f"Workspace of {question.rig.name}{where}"
     chapters = [_chapter(folder, maps) for maps in made]
-    write_atomic(folder / PAGE, page(title, _lead(question), chapters))
-    summary = {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
+    about = about_of(question)
+    lead = (_lead(question), about_text(about))
+    write_atomic(folder / PAGE, page(title, lead, chapters))
+    summary = {ABOUT: about} | {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
     write_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
     return summary
 
@@ -69,10 +81,9 @@ def _lead(question: Question) -> str:
     """First sentence of the page."""
     rig = question.rig
     reserve = max(margin_reserve(rig, load, turns=False) for load in question.loads)
-    rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost{rotated}. At"
+        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost. At"
         f" start, stops and goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity"
         f" margin of {reserve:.3g} N beyond what is mapped as allowed."
     )

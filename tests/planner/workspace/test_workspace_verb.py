@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import resource
+from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib as mpl
@@ -128,6 +129,30 @@ def test_the_summary_is_what_is_printed(folder):
     printed = json.loads((folder / "printed.json").read_text())
     assert printed["maps"] == json.loads((folder / "summary.json").read_text())
     assert printed["maps"]["slice_z_445"]["share"]["closed"] == 1.0
+
+
+def test_summary_and_page_name_what_was_mapped(tmp_path):
+    rig, scene = load_rig(Path(RIG)), load_scene(Path(SCENE))
+    tilted = ("--rotation-wxyz", "0.9961946980917455", "0.08715574274765817", "0", "0")
+    where = tmp_path / "maps"
+    options = ("--slice", "z=445", "--step-mm", "100", *tilted)
+    assert run(RIG, "--scene", SCENE, "-o", str(where), *options).exit_code == 0
+    about = json.loads((where / "summary.json").read_text())["about"]
+    assert about["rig"] == {"name": rig.name, "plan_hash": rig.plan_hash}
+    assert about["scene"] == {"name": scene.name, "hash": scene.hash}
+    assert about["rotation_wxyz"] == pytest.approx([float(x) for x in tilted[1:]], abs=1e-12)
+    assert about["characteristic_length_mm"] == pytest.approx(
+        Question.about(rig).length * 1e3, abs=1e-9
+    )
+    assert about["version"] == version("cdpr")
+    page = (where / "index.html").read_text()
+    for text in (rig.plan_hash, scene.hash, "0.996195 0.0871557 0 0", version("cdpr")):
+        assert text in page
+
+
+def test_maps_without_a_scene_name_none(folder):
+    assert json.loads((folder / "summary.json").read_text())["about"]["scene"] is None
+    assert "no scene" in (folder / "index.html").read_text()
 
 
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):
