@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Set
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 Draw = Callable[[], "Figure"]
 PAGE = "index.html"
 SUMMARY = "summary.json"
+_GRID = re.compile(r"slice_[xyz]_(minus_)?[\d.]+(e(\+|minus_)\d+)?|frame|workspace")
 _LEVELS_OF = (
     "capacity_margin",
     "dexterity_cost",
@@ -58,6 +60,8 @@ def write_maps(
     folder: Path, made: list[Maps], question: Question, scene: Scene | None = None
 ) -> dict[str, Any]:
     """Writes all files and returns the summaries by name of grid, after what they are about.
+
+    Then removes the maps of a former run from the folder.
 
     Args:
         folder: An existing folder.
@@ -74,7 +78,32 @@ def write_maps(
     write_atomic(folder / PAGE, page(title, lead, chapters))
     summary = {ABOUT: about} | {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
     write_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
+    shown = {name for chapter in chapters for name in (*chapter.tables, *dict(chapter.pictures))}
+    _remove_former(folder, kept={Path(name).stem for name in shown})
     return summary
+
+
+def _remove_former(folder: Path, kept: Set[str]) -> None:
+    """Removes files of maps but those ``kept``, named without suffix.
+
+    A map has its arrays beside it, so other files with such names stay.
+    """
+    for arrays in list(folder.glob("*.npz")):
+        if _GRID.fullmatch(arrays.stem):
+            for name in _files_of(arrays.stem):
+                if Path(name).stem not in kept and (folder / name).is_file():
+                    (folder / name).unlink()
+
+
+def _files_of(grid: str) -> list[str]:
+    """Names of all files that a grid can have; that of its arrays last."""
+    figures, tables = [grid, f"{grid}_costs"], [f"{grid}.csv"]
+    if grid == "frame":
+        figures, tables = [grid], []
+    elif grid == "workspace":
+        figures, tables = [f"{grid}_{quantity}" for quantity in _LEVELS_OF], []
+    images = [f"{figure}.{kind}" for figure in figures for kind in ("png", "svg")]
+    return [*images, *tables, f"{grid}.npz"]
 
 
 def _lead(question: Question) -> str:

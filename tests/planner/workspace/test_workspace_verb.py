@@ -162,6 +162,22 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
+def test_maps_replace_all_of_a_former_run_and_nothing_else(tmp_path, slice_maps, whole):
+    """Also where that run ended before its summary; files without a map's arrays are others'."""
+    question = slice_maps[1]
+    planes = [parsed_slice("x=-50"), parsed_slice("z=400.5")]
+    former = workspace_grids(question.rig, planes, volume=True, step=0.2)
+    write_maps(tmp_path, map_workspace(question, former, workers=1), question)
+    (tmp_path / "summary.json").unlink()
+    made = {"slice_x_minus_50_costs.png", "slice_z_400.5.csv", "workspace.npz", "frame.svg"}
+    assert made | {"workspace_self_clearance.png"} <= set(written(tmp_path))
+    own = ["slice_z_notes.npz", "slice_z_445.txt", "workspace.png", "frame.csv", "slice_y_1.csv"]
+    for name in own:
+        (tmp_path / name).write_text("mine")
+    write_maps(tmp_path, *slice_maps)
+    assert written(tmp_path) == {**whole, **dict.fromkeys(own, b"mine")}
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
