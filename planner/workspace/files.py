@@ -14,6 +14,7 @@ import numpy as np
 
 from model.files.documents import write_atomic, write_bytes_atomic
 from model.scene import Scene
+from model.statics.gravity import inertial_wrench
 from planner.costs import margin_reserve
 from planner.settings import CLEARANCE_RESERVE
 from planner.workspace.compute import Maps
@@ -107,14 +108,16 @@ def _files_of(grid: str) -> list[str]:
 
 
 def _lead(question: Question) -> str:
-    """First sentence of the page."""
+    """First sentences of the page."""
     rig = question.rig
+    inertia = max(inertial_wrench(rig, load, turns=False) for load in question.loads)
     reserve = max(margin_reserve(rig, load, turns=False) for load in question.loads)
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost. At"
-        f" start, stops and goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity"
-        f" margin of {reserve:.3g} N beyond what is mapped as allowed."
+        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost."
+        " Beyond what is mapped as allowed, along the whole path, `cdpr check` also requires a"
+        f" capacity margin of {inertia:.3g} N for acceleration, and `cdpr plan` keeps"
+        f" {CLEARANCE_RESERVE * 1e3:g} mm and a capacity margin of {reserve:.3g} N."
     )
 
 

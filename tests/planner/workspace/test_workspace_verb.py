@@ -17,7 +17,9 @@ from typer.testing import CliRunner
 from cdpr.cli.app import build_app
 from model.errors import BadInput
 from model.rig import load_rig
-from model.scene import load_scene
+from model.scene import legs_of, load_scene
+from model.statics.gravity import inertial_wrench
+from planner.costs import margin_reserve
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.figures import space_scene
 from planner.workspace.files import write_maps
@@ -148,6 +150,19 @@ def test_summary_and_page_name_what_was_mapped(tmp_path):
     page = (where / "index.html").read_text()
     for text in (rig.plan_hash, scene.hash, "0.996195 0.0871557 0 0", version("cdpr")):
         assert text in page
+
+
+def test_the_page_states_the_margins_that_check_and_plan_also_require(tmp_path, slice_maps):
+    """With the heaviest payload that the scene carries."""
+    rig, scene = slice_maps[1].rig, load_scene(CONFIGS / "pick_and_place.yaml")
+    loads = [leg.scene.load for leg in legs_of(scene)]
+    checked = max(inertial_wrench(rig, load, turns=False) for load in loads)
+    planned = max(margin_reserve(rig, load, turns=False) for load in loads)
+    assert planned > margin_reserve(rig, scene.load, turns=False)
+    write_maps(tmp_path, [], Question.about(rig, scene), scene)
+    page = (tmp_path / "index.html").read_text()
+    assert f"`cdpr check` also requires a capacity margin of {checked:.3g} N" in page
+    assert f"`cdpr plan` keeps 0.05 mm and a capacity margin of {planned:.3g} N" in page
 
 
 def test_maps_without_a_scene_name_none(folder):
