@@ -68,7 +68,7 @@ class Maps:
 
     @property
     def feasible(self) -> NDArray[np.bool_]:
-        """Where the tension limits suffice for weight, payload and disturbances."""
+        """Where the tension limits suffice for weight, every payload and disturbances."""
         return np.asarray(self.values["capacity_margin"] >= 0.0)
 
     @property

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Set
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from model.files.documents import write_atomic, write_bytes_atomic
 from model.scene import Scene
+from model.statics.gravity import inertial_wrench
 from planner.costs import margin_reserve
 from planner.settings import CLEARANCE_RESERVE
 from planner.workspace.compute import Maps
@@ -27,7 +29,17 @@ from planner.workspace.figures import (
     write_figures,
 )
 from planner.workspace.maps import Question
-from planner.workspace.report import Chapter, arrays_of, csv_of, page, shown_in, summary_of
+from planner.workspace.report import (
+    ABOUT,
+    Chapter,
+    about_of,
+    about_text,
+    arrays_of,
+    csv_of,
+    page,
+    shown_in,
+    summary_of,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,6 +47,7 @@ if TYPE_CHECKING:
 Draw = Callable[[], "Figure"]
 PAGE = "index.html"
 SUMMARY = "summary.json"
+_GRID = re.compile(r"slice_[xyz]_(minus_)?[\d.]+(e(\+|minus_)\d+)?|frame|workspace")
 _LEVELS_OF = (
     "capacity_margin",
     "dexterity_cost",
@@ -47,7 +60,9 @@ _LEVELS_OF = (
 def write_maps(
     folder: Path, made: list[Maps], question: Question, scene: Scene | None = None
 ) -> dict[str, Any]:
-    """Writes all files and returns the summaries by name of grid.
+    """Writes all files and returns the summaries by name of grid, after what they are about.
+
+    Then removes the maps of a former run from the folder.
 
     Args:
         folder: An existing folder.
@@ -59,23 +74,50 @@ def write_maps(
     where = f" in {scene.name}" if scene else ""
     title = f"Workspace of {question.rig.name}{where}"
     chapters = [_chapter(folder, maps) for maps in made]
-    write_atomic(folder / PAGE, page(title, _lead(question), chapters))
-    summary = {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
+    about = about_of(question)
+    lead = (_lead(question), about_text(about))
+    write_atomic(folder / PAGE, page(title, lead, chapters))
+    summary = {ABOUT: about} | {m.grid.name: c.summary for m, c in zip(made, chapters, strict=True)}
     write_atomic(folder / SUMMARY, json.dumps(summary, indent=1) + "\n")
+    shown = {name for chapter in chapters for name in (*chapter.tables, *dict(chapter.pictures))}
+    _remove_former(folder, kept={Path(name).stem for name in shown})
     return summary
 
 
+def _remove_former(folder: Path, kept: Set[str]) -> None:
+    """Removes files of maps but those ``kept``, named without suffix.
+
+    A map has its arrays beside it, so other files with such names stay.
+    """
+    for arrays in list(folder.glob("*.npz")):
+        if _GRID.fullmatch(arrays.stem):
+            for name in _files_of(arrays.stem):
+                if Path(name).stem not in kept and (folder / name).is_file():
+                    (folder / name).unlink()
+
+
+def _files_of(grid: str) -> list[str]:
+    """Names of all files that a grid can have; that of its arrays last."""
+    figures, tables = [grid, f"{grid}_costs"], [f"{grid}.csv"]
+    if grid == "frame":
+        figures, tables = [grid], []
+    elif grid == "workspace":
+        figures, tables = [f"{grid}_{quantity}" for quantity in _LEVELS_OF], []
+    images = [f"{figure}.{kind}" for figure in figures for kind in ("png", "svg")]
+    return [*images, *tables, f"{grid}.npz"]
+
+
 def _lead(question: Question) -> str:
-    """First sentence of the page."""
+    """First sentences of the page."""
     rig = question.rig
-    load = None if question.scene is None else question.scene.load
-    reserve = margin_reserve(rig, load, turns=False)
-    rotated = "" if abs(question.rotation.trace() - 3.0) < 1e-12 else ", platform rotated"
+    inertia = max(inertial_wrench(rig, load, turns=False) for load in question.loads)
+    reserve = max(margin_reserve(rig, load, turns=False) for load in question.loads)
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
-        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost{rotated}. At"
-        f" start, stops and goal `cdpr plan` keeps {CLEARANCE_RESERVE * 1e3:g} mm and a capacity"
-        f" margin of {reserve:.3g} N beyond what is mapped as allowed."
+        f" {question.length * 1e3:.1f} mm in condition number and dexterity cost."
+        " Beyond what is mapped as allowed, along the whole path, `cdpr check` also requires a"
+        f" capacity margin of {inertia:.3g} N for acceleration, and `cdpr plan` keeps"
+        f" {CLEARANCE_RESERVE * 1e3:g} mm and a capacity margin of {reserve:.3g} N."
     )
 
 

@@ -15,7 +15,7 @@ from model.clearance import SelfModel
 from model.kinematics import Cables, cables_exist, cables_to, structure_matrix_of
 from model.pose import Array, Pose
 from model.rig import Rig
-from model.scene import Scene
+from model.scene import Load, Scene, legs_of
 from model.statics.feasibility import WrenchBox, capacity_margin, closure_margin
 from model.statics.gravity import weight_wrench
 from model.statics.wrench_sets import (
@@ -39,7 +39,7 @@ class Question:
 
     Attributes:
         rig: The robot.
-        scene: Its obstacles, clearances and load; without one only the robot's own weight acts.
+        scene: Its obstacles, clearances and loads; without one only the robot's own weight acts.
         rotation: Orientation of the platform, ``world_from_platform``, shape (3, 3).
         length: Divides the moments in the condition number and so in the dexterity cost, [m].
         quantities: Names of those mapped, from `OF_THE_ROBOT` and `OBSTACLE_CLEARANCE`.
@@ -78,6 +78,14 @@ class Question:
             names.append(OBSTACLE_CLEARANCE)
         used = rms_anchor_radius(rig.anchors) if length is None else checked_length(length)
         return cls(rig, scene, rotation, used, tuple(names))
+
+    @property
+    def loads(self) -> tuple[Load | None, ...]:
+        """Those of the scene's legs, each once; one that is None without a scene."""
+        if self.scene is None:
+            return (None,)
+        carried = [leg.scene.load for leg in legs_of(self.scene)]
+        return tuple({(x.payload_mass, *x.payload_centre.tolist()): x for x in carried}.values())
 
 
 def values_at(question: Question, positions: Array) -> Values:
@@ -122,19 +130,20 @@ def _closure(robots: _Robots) -> Array:
 
 
 def _capacity(robots: _Robots) -> Array:
-    rig = robots.question.rig
-    return capacity_margin(
-        robots.matrices,
-        rig.min_tension,
-        rig.max_tension,
-        _external(robots.question),
-        rms_anchor_radius(rig.anchors),
-    )
+    """The smallest with any load of the scene."""
+    question, matrices = robots.question, robots.matrices
+    rig = question.rig
+    limits, radius = (rig.min_tension, rig.max_tension), rms_anchor_radius(rig.anchors)
+    margins = [
+        capacity_margin(matrices, *limits, _external(question, load), radius)
+        for load in question.loads
+    ]
+    return np.asarray(np.min(margins, axis=0))
 
 
-def _external(question: Question) -> WrenchBox:
-    """Weight, and the box of disturbances of the scene."""
-    rig, load = question.rig, question.scene.load if question.scene else None
+def _external(question: Question, load: Load | None) -> WrenchBox:
+    """Weight, and the load's box of disturbances."""
+    rig = question.rig
     weight = weight_wrench(rig, Pose(rig.home.position, question.rotation), load)
     if load is None:
         return WrenchBox.of_one(weight)

@@ -7,6 +7,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
+from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,10 @@ from model.pages.page import page as html_page
 from model.pages.page import paragraph, picture, section, table
 from model.pages.scene import SceneFigure
 from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
+from model.pose import quaternion_from_matrix
 from planner.workspace.compute import VERDICTS, Maps
 from planner.workspace.grid import AXES
+from planner.workspace.maps import Question
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +46,18 @@ class Chapter:
     layers: tuple[tuple[str, str, str, bool], ...] = ()
 
 
-def page(title: str, lead: str, chapters: Sequence[Chapter]) -> str:
-    """The whole page."""
+def page(title: str, lead: Sequence[str], chapters: Sequence[Chapter]) -> str:
+    """The whole page; ``lead`` is its first paragraphs."""
     body = "\n".join(_section(k, chapter) for k, chapter in enumerate(chapters, start=1))
     scenes = [chapter.scene for chapter in chapters if chapter.scene]
     scripts, data = (SCENE_SCRIPTS, page_data(scenes[0])) if scenes else ((), None)
     return html_page(
-        title, body, lead=paragraph(lead), scripts=scripts, data=data, files_beside=True
+        title,
+        body,
+        lead="".join(map(paragraph, lead)),
+        scripts=scripts,
+        data=data,
+        files_beside=True,
     )
 
 
@@ -185,14 +193,43 @@ def summary_of(maps: Maps) -> dict[str, Any]:
     }  # fmt: skip
 
 
+ABOUT = "about"
+"""Key of `about_of` beside the summaries of grids, none of which has this name."""
+
+
+def about_of(question: Question) -> dict[str, Any]:
+    """What maps were computed for and with: all that their values depend on but the grids."""
+    rig, scene = question.rig, question.scene
+    return {
+        "rig": {"name": rig.name, "plan_hash": rig.plan_hash},
+        "scene": None if scene is None else {"name": scene.name, "hash": scene.hash},
+        "rotation_wxyz": quaternion_from_matrix(question.rotation).tolist(),
+        "characteristic_length_mm": question.length * 1e3,
+        "version": version("cdpr"),
+    }
+
+
+def about_text(about: Mapping[str, Any]) -> str:
+    """The same as a sentence."""
+    rig, scene = about["rig"], about["scene"]
+    within = "no scene" if scene is None else f"scene {scene['name']}, hash {scene['hash']}"
+    rotation = " ".join(f"{number:.6g}" for number in about["rotation_wxyz"])
+    return (
+        f"Rig {rig['name']}, hash {rig['plan_hash']}; {within}; rotation w x y z {rotation};"
+        f" cdpr {about['version']}."
+    )
+
+
 def summary_facts(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Human-readable summary, one line per map.
 
     Args:
-        summary: Of each map, see `summary_of`, by its name.
+        summary: Of each map, see `summary_of`, by its name; beside them `ABOUT`.
     """
     facts = []
     for name, found in summary.items():
+        if name == ABOUT:
+            continue
         share = found["share"]
         margin = found["range"]["capacity_margin_n"]
         text = (

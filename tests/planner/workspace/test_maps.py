@@ -18,7 +18,7 @@ from model.errors import BadInput
 from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig
-from model.scene import empty_scene
+from model.scene import Scene, empty_scene, legs_of
 from planner import parallel
 from planner.check import NEAR_AXIS, check_path
 from planner.costs import KinematicCost, capacity_margins, finite_range
@@ -208,6 +208,22 @@ def test_the_scene_s_clearances_decide_what_is_free(gachon, extremes, ready_scen
         assert maps.collision_free[0, 0, 0] == (verdict == 0)
     tight = replace(question, scene=scene.changed(clearance=0.5))
     assert compute(tight, extremes, grid).verdict[0, 0, 0] == near
+
+
+def test_a_pose_is_feasible_with_every_payload_of_the_scene(gachon, extremes, ready_scene):
+    """The cables hold the empty platform at the tray, but not a part of 20 kg."""
+    document = ready_scene("pick_and_place").as_dict()
+    for stop in document["stops"]:
+        if "mass_kg" in stop:
+            stop["mass_kg"] = 20.0
+    scene = Scene.from_dict(document)
+    tray = scene.stops[0].pose
+    margins = [gachon.at(tray, leg.scene.load).capacity_margin for leg in legs_of(scene)]
+    grid = volume("at", tray.position, tray.position + 1e-6, 1.0)
+    maps = compute(Question.about(gachon, scene), extremes, grid)
+    assert min(margins) < 0.0 < margins[0]
+    assert maps.values["capacity_margin"][0, 0, 0] == pytest.approx(min(margins), abs=1e-9)
+    assert maps.verdict[0, 0, 0] == VERDICTS.index("not wrench feasible")
 
 
 def test_other_workers_and_parts_change_no_value(gachon, extremes, monkeypatch):

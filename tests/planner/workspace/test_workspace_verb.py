@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import resource
+from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib as mpl
@@ -16,7 +17,9 @@ from typer.testing import CliRunner
 from cdpr.cli.app import build_app
 from model.errors import BadInput
 from model.rig import load_rig
-from model.scene import load_scene
+from model.scene import legs_of, load_scene
+from model.statics.gravity import inertial_wrench
+from planner.costs import margin_reserve
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.figures import space_scene
 from planner.workspace.files import write_maps
@@ -130,11 +133,64 @@ def test_the_summary_is_what_is_printed(folder):
     assert printed["maps"]["slice_z_445"]["share"]["closed"] == 1.0
 
 
+def test_summary_and_page_name_what_was_mapped(tmp_path):
+    rig, scene = load_rig(Path(RIG)), load_scene(Path(SCENE))
+    tilted = ("--rotation-wxyz", "0.9961946980917455", "0.08715574274765817", "0", "0")
+    where = tmp_path / "maps"
+    options = ("--slice", "z=445", "--step-mm", "100", *tilted)
+    assert run(RIG, "--scene", SCENE, "-o", str(where), *options).exit_code == 0
+    about = json.loads((where / "summary.json").read_text())["about"]
+    assert about["rig"] == {"name": rig.name, "plan_hash": rig.plan_hash}
+    assert about["scene"] == {"name": scene.name, "hash": scene.hash}
+    assert about["rotation_wxyz"] == pytest.approx([float(x) for x in tilted[1:]], abs=1e-12)
+    assert about["characteristic_length_mm"] == pytest.approx(
+        Question.about(rig).length * 1e3, abs=1e-9
+    )
+    assert about["version"] == version("cdpr")
+    page = (where / "index.html").read_text()
+    for text in (rig.plan_hash, scene.hash, "0.996195 0.0871557 0 0", version("cdpr")):
+        assert text in page
+
+
+def test_the_page_states_the_margins_that_check_and_plan_also_require(tmp_path, slice_maps):
+    """With the heaviest payload that the scene carries."""
+    rig, scene = slice_maps[1].rig, load_scene(CONFIGS / "pick_and_place.yaml")
+    loads = [leg.scene.load for leg in legs_of(scene)]
+    checked = max(inertial_wrench(rig, load, turns=False) for load in loads)
+    planned = max(margin_reserve(rig, load, turns=False) for load in loads)
+    assert planned > margin_reserve(rig, scene.load, turns=False)
+    write_maps(tmp_path, [], Question.about(rig, scene), scene)
+    page = (tmp_path / "index.html").read_text()
+    assert f"`cdpr check` also requires a capacity margin of {checked:.3g} N" in page
+    assert f"`cdpr plan` keeps 0.05 mm and a capacity margin of {planned:.3g} N" in page
+
+
+def test_maps_without_a_scene_name_none(folder):
+    assert json.loads((folder / "summary.json").read_text())["about"]["scene"] is None
+    assert "no scene" in (folder / "index.html").read_text()
+
+
 def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     result = run(RIG, "-o", str(tmp_path), "--slice", "z=445")
     assert isinstance(result.exception, BadInput)
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_maps_replace_all_of_a_former_run_and_nothing_else(tmp_path, slice_maps, whole):
+    """Also where that run ended before its summary; files without a map's arrays are others'."""
+    question = slice_maps[1]
+    planes = [parsed_slice("x=-50"), parsed_slice("z=400.5")]
+    former = workspace_grids(question.rig, planes, volume=True, step=0.2)
+    write_maps(tmp_path, map_workspace(question, former, workers=1), question)
+    (tmp_path / "summary.json").unlink()
+    made = {"slice_x_minus_50_costs.png", "slice_z_400.5.csv", "workspace.npz", "frame.svg"}
+    assert made | {"workspace_self_clearance.png"} <= set(written(tmp_path))
+    own = ["slice_z_notes.npz", "slice_z_445.txt", "workspace.png", "frame.csv", "slice_y_1.csv"]
+    for name in own:
+        (tmp_path / name).write_text("mine")
+    write_maps(tmp_path, *slice_maps)
+    assert written(tmp_path) == {**whole, **dict.fromkeys(own, b"mine")}
 
 
 @pytest.mark.parametrize(
