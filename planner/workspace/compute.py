@@ -215,7 +215,7 @@ def map_workspace(
     dask: str | None = None,
     listener: Listener = SILENT,
 ) -> list[Maps]:
-    """Workspace maps of a rig; `planner.workspace.report.write_maps` writes them.
+    """Workspace maps of a rig; `planner.workspace.files.write_maps` writes them.
 
     Args:
         question: Rig, scene, orientation and quantities.
