@@ -115,8 +115,8 @@ def _lead(question: Question) -> str:
     return (
         f"Tensions {rig.min_tension:g} to {rig.max_tension:g} N; moments divided by"
         f" {question.length * 1e3:.1f} mm in condition number and dexterity cost."
-        " Beyond what is mapped as allowed, along the whole path, `cdpr check` also requires a"
-        f" capacity margin of {inertia:.3g} N for acceleration, and `cdpr plan` keeps"
+        " Beyond what is mapped as allowed, along the whole path, cdpr check also requires a"
+        f" capacity margin of {inertia:.3g} N for acceleration, and cdpr plan keeps"
         f" {CLEARANCE_RESERVE * 1e3:g} mm and a capacity margin of {reserve:.3g} N."
     )
 

@@ -161,8 +161,8 @@ def test_the_page_states_the_margins_that_check_and_plan_also_require(tmp_path, 
     assert planned > margin_reserve(rig, scene.load, turns=False)
     write_maps(tmp_path, [], Question.about(rig, scene), scene)
     page = (tmp_path / "index.html").read_text()
-    assert f"`cdpr check` also requires a capacity margin of {checked:.3g} N" in page
-    assert f"`cdpr plan` keeps 0.05 mm and a capacity margin of {planned:.3g} N" in page
+    assert f"cdpr check also requires a capacity margin of {checked:.3g} N" in page
+    assert f"cdpr plan keeps 0.05 mm and a capacity margin of {planned:.3g} N" in page
 
 
 def test_maps_without_a_scene_name_none(folder):
