@@ -301,14 +301,14 @@ class TorqueLost(Refused):
         )
 
 
-def answers_twice(node: int, otherwise: str = "") -> Refused:
-    """Two devices have the same node id; ``otherwise`` is a further possible cause."""
+def answers_twice(node: int, otherwise: str = "", cure: str = "") -> Refused:
+    """Two devices have the same node id; ``otherwise`` is another possible cause, with its cure."""
     return Refused(
         f"drive {node} answered twice",
         where=SETTING_UP,
         why="two devices have this node id, or `cdpr sim` was started twice"
         + (f", or {otherwise}" if otherwise else ""),
-        next_step="give each device on the bus a unique node id",
+        next_step="give each device on the bus a unique node id" + (f", or {cure}" if cure else ""),
         values={"node": node},
     )
 

@@ -155,11 +155,15 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
     drives = rig.document.drives
     if not isinstance(drives, OdriveDocument):
         return []
+    from drivers.odrive.configure import check_periods, check_resolution, check_speeds
     from drivers.odrive.endpoints import read_endpoints
     from drivers.odrive.messages import read_layouts
 
     try:
-        read_layouts(drives.dbc)
+        layouts = read_layouts(drives.dbc)
+        check_resolution(rig)
+        check_speeds(rig, layouts)
+        check_periods(rig, drives)
         if drives.endpoints is not None:
             read_endpoints(Path(drives.endpoints), drives)
     except BadInput as error:

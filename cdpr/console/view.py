@@ -86,7 +86,7 @@ def nearest_data(nearest: Nearest, required: float) -> dict[str, Any]:
     """
     points = np.stack([nearest.first_point, nearest.second_point])
     return {
-        "now": round(nearest.distance * 1e3, 1),
+        "now": round(nearest.distance * 1e3, 6),
         "required": round(required * 1e3, 6),
         "pair": [nearest.first, nearest.second],
         "points_mm": (np.round(points * 1e3, 1) + 0.0).tolist(),

@@ -303,7 +303,7 @@ def _answers(
     received: Answers = {}
     for node, values in link.answers(layout, timeout):
         if node in received and once:
-            raise answers_twice(node, SENT_CYCLICALLY)
+            raise answers_twice(node, SENT_CYCLICALLY, "set version_msg_rate_ms to 0")
         if node in nodes:
             received[node] = values
         if len(received) == len(nodes):
@@ -330,7 +330,7 @@ def _check_versions(
     versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True, once=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
-            raise answers_twice(node, SENT_CYCLICALLY)
+            raise answers_twice(node, SENT_CYCLICALLY, "set version_msg_rate_ms to 0")
     for node, (_, *numbers) in versions.items():
         board, firmware = tuple(map(int, numbers[:3])), tuple(map(int, numbers[3:]))
         if firmware[:2] < OLDEST_FIRMWARE:
@@ -357,7 +357,8 @@ def _require_version(
             f"its {kind} is {text}, drives.endpoints is for {wanted}",
             where=f"drive {node}",
             why=f"endpoint numbers differ between {kind} versions",
-            next_step=f"use the flat_endpoints.json of the drive's {kind}",
+            next_step=f"use the flat_endpoints.json of the drive's {kind}, or leave out"
+            " drives.endpoints if the drives differ",
             values={"node": node, kind: text},
         )
 

@@ -196,7 +196,7 @@ def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
 def _version(key: str, text: str, example: str) -> tuple[int, int, int]:
     """The three numbers of a version such as ``0.6.11-1``."""
     matched = re.match(r"(\d{1,5})\.(\d{1,5})\.(\d{1,5})(?:-|$)", text, re.ASCII)
-    if matched is None:
+    if matched is None or max(map(int, matched.groups())) > 255:  # a byte each in Get_Version
         raise ValueError(f"{key} is {text!r}, not a version such as {example}")
     major, minor, revision = map(int, matched.groups())
     return major, minor, revision

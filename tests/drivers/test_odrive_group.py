@@ -29,6 +29,7 @@ from drivers.odrive.messages import (
     status_word,
 )
 from drivers.odrive.monitor import OdriveMonitor
+from executor.doctor import rig_drives
 from model.errors import BadInput, Fault, HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig, rig_from_document
@@ -478,6 +479,7 @@ def test_a_drive_that_reports_its_version_on_its_own_is_refused_by_that_setting(
     with pytest.raises(Refused) as caught:
         bench.group.configure()
     assert "version_msg_rate_ms is not 0" in caught.value.why
+    assert "set version_msg_rate_ms to 0" in caught.value.next_step
 
 
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
@@ -608,8 +610,16 @@ def test_endpoints_of_another_board_are_refused_before_any_is_written(tmp_path: 
             bench.group.configure()
         commands = {node_and_command(m.arbitration_id)[1] for m in bench.frames()}
     assert got.value.where == "drive 8"
-    assert "board" in got.value.next_step
+    assert "board, or leave out drives.endpoints" in got.value.next_step
     assert RXSDO not in commands
+
+
+def test_doctor_reports_what_only_the_rig_file_makes_wrong() -> None:
+    (good,) = rig_drives(odrive_rig(estimates_ms=50))
+    (rare,) = rig_drives(odrive_rig(estimates_ms=51))
+    assert good.good
+    assert not rare.good
+    assert "encoder_msg_rate_ms" in rare.fix
 
 
 def test_endpoints_of_no_stated_board_are_refused_in_one_sentence(tmp_path: Path) -> None:
@@ -631,6 +641,7 @@ def test_endpoints_of_no_stated_board_are_refused_in_one_sentence(tmp_path: Path
         '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints": {}}',
         '{"fw_version": "9e99.6.11", "hw_version": "4.4.58", "endpoints": {}}',
         '{"fw_version": "0.6.11", "hw_version": "4.4", "endpoints": {}}',
+        '{"fw_version": "0.6.11", "hw_version": "4.4.300", "endpoints": {}}',
         '{"fw_version": "0.6", "hw_version": "4.4.58", "endpoints": {}}',
         '{"fw_version": "0.6.11", "hw_version": "4.4.58", "endpoints":'
         ' {"axis0.config.watchdog_timeout": 3}}',
