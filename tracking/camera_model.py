@@ -19,7 +19,7 @@ from model.pose import Array, require_unmasked
 from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
-_CONVERGED = 1e-3
+_CONVERGED = 1e-5
 """Rays of OpenCV's iteration are refined if they miss their pixel by more, [px]."""
 _SIMPLE, _BEND = 5, 0.4
 """OpenCV's iteration converges for up to this number of coefficients, where the radial terms change
