@@ -155,17 +155,15 @@ def rig_drives(rig: Rig) -> list[MachineCheck]:
     drives = rig.document.drives
     if not isinstance(drives, OdriveDocument):
         return []
-    from drivers.odrive.configure import check_periods, check_resolution, check_speeds
+    from drivers.odrive.configure import check_rig
     from drivers.odrive.endpoints import read_endpoints
     from drivers.odrive.messages import read_layouts
 
     try:
         layouts = read_layouts(drives.dbc)
-        check_resolution(rig)
-        check_speeds(rig, layouts)
-        check_periods(rig, drives)
+        check_rig(rig, drives, layouts)
         if drives.endpoints is not None:
-            read_endpoints(Path(drives.endpoints), drives)
+            read_endpoints(Path(drives.endpoints), drives, layouts)
     except BadInput as error:
         return [MachineCheck("drives", False, f"{error.where}: {error.what}", error.next_step)]
     known = (

@@ -79,11 +79,10 @@ class ImageFolder:
         wanted = (self._camera.width, self._camera.height)
         none_read = True
         for number, (name, path) in enumerate(zip(self.names, self.files, strict=True)):
-            stored = read_picture(path)
-            image = stored if _size(stored) == wanted else read_picture(path, wanted)
+            image, is_rotated = _read(path, wanted)
             none_read &= image is None
             if image is not None and _size(image) == wanted:
-                if image is not stored:
+                if is_rotated:
                     self._camera.require_unrotated(str(path))
                 yield Frame(number / self.rate, image, name, number)
                 continue
@@ -182,12 +181,17 @@ def read_picture(path: Path, size: tuple[int, int] | None = None) -> Image | Non
         path: The file.
         size: Width and height of the camera's images, [px]; None for as stored.
     """
+    return _read(path, size)[0]
+
+
+def _read(path: Path, size: tuple[int, int] | None) -> tuple[Image | None, bool]:
+    """The image as for `read_picture`, and whether it was rotated."""
     data = _data(path)
     image = _decoded(data)
     if image is None or size in (None, _size(image)):
-        return image
+        return image, False
     rotated = _decoded(data, upright=True)
-    return rotated if _size(rotated) == size else image
+    return (rotated, True) if _size(rotated) == size else (image, False)
 
 
 def _data(path: Path) -> bytes:

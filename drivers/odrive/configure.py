@@ -59,7 +59,8 @@ RESPONSE_TIMEOUT = 0.5
 ECHO_WAIT = 0.05
 """Time within which a second device with the same node id answers, [s]."""
 
-SENT_CYCLICALLY = "its version_msg_rate_ms is not 0"
+SENT_CYCLICALLY = ("its version_msg_rate_ms is not 0", "set version_msg_rate_ms to 0")
+"""Another cause of two version messages, and its cure."""
 
 OPCODE_READ, OPCODE_WRITE = 0, 1
 
@@ -192,10 +193,10 @@ def configure_drives(
     cleared if all brakes are closed.
     """
     nodes = tuple(winch.node_id for winch in rig.winches)
-    check_resolution(rig)
-    check_speeds(rig, layouts)
-    check_periods(rig, document)
-    known = read_endpoints(Path(document.endpoints), document) if document.endpoints else None
+    check_rig(rig, document, layouts)
+    known = (
+        read_endpoints(Path(document.endpoints), document, layouts) if document.endpoints else None
+    )
     link = SetupLink(bus, pump, layouts, nodes)
     _check_versions(link, layouts, nodes, known)
     _check_idle(link, layouts, nodes, document, to_reset)
@@ -220,6 +221,17 @@ def configure_drives(
     )
 
 
+def check_rig(rig: Rig, document: OdriveDocument, layouts: Layouts) -> None:
+    """Requires positions, speeds and message periods that ODrives can meet.
+
+    Raises:
+        BadInput: One cannot be met.
+    """
+    check_resolution(rig)
+    _check_speeds(rig, layouts)
+    _check_periods(rig, document)
+
+
 def check_resolution(rig: Rig) -> None:
     """Requires that set-points, 32-bit floats in turns, resolve every count of the travel.
 
@@ -238,7 +250,7 @@ def check_resolution(rig: Rig) -> None:
             )
 
 
-def check_speeds(rig: Rig, layouts: Layouts) -> None:
+def _check_speeds(rig: Rig, layouts: Layouts) -> None:
     """Requires that feed-forward, 16 bits, holds the top speed of every winch.
 
     Raises:
@@ -258,7 +270,7 @@ def check_speeds(rig: Rig, layouts: Layouts) -> None:
             )
 
 
-def check_periods(rig: Rig, document: OdriveDocument) -> None:
+def _check_periods(rig: Rig, document: OdriveDocument) -> None:
     """Requires positions and torques often enough for the monitors.
 
     Raises:
@@ -303,7 +315,7 @@ def _answers(
     received: Answers = {}
     for node, values in link.answers(layout, timeout):
         if node in received and once:
-            raise answers_twice(node, SENT_CYCLICALLY, "set version_msg_rate_ms to 0")
+            raise answers_twice(node, *SENT_CYCLICALLY)
         if node in nodes:
             received[node] = values
         if len(received) == len(nodes):
@@ -330,7 +342,7 @@ def _check_versions(
     versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True, once=True)
     for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
         if node in nodes:
-            raise answers_twice(node, SENT_CYCLICALLY, "set version_msg_rate_ms to 0")
+            raise answers_twice(node, *SENT_CYCLICALLY)
     for node, (_, *numbers) in versions.items():
         board, firmware = tuple(map(int, numbers[:3])), tuple(map(int, numbers[3:]))
         if firmware[:2] < OLDEST_FIRMWARE:

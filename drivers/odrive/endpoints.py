@@ -14,7 +14,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from drivers.odrive.messages import Layouts, read_layouts
+from drivers.odrive.messages import Layouts
 from model.errors import BadInput
 from model.files.reading import read_json
 from model.files.rig_file import OdriveDocument
@@ -150,15 +150,15 @@ def _steps_per_unit(signal: str, step: float | None, document: OdriveDocument) -
     return scale, f"the DBC file gives {signal} steps of {step:g}"
 
 
-def read_endpoints(path: Path, document: OdriveDocument) -> Endpoints:
+def read_endpoints(path: Path, document: OdriveDocument, layouts: Layouts) -> Endpoints:
     """The endpoints in a `flat_endpoints.json`.
 
     Raises:
         BadInput: The file cannot be read, has another format, lacks a required endpoint or its
-            board, or as for `read_layouts` and `wanted_settings`.
+            board, or as for `wanted_settings`.
     """
     content = read_json(path, _OTHER_FILE)
-    names = [wanted.name for wanted in wanted_settings(document, read_layouts(document.dbc))]
+    names = [wanted.name for wanted in wanted_settings(document, layouts)]
     try:
         file = _EndpointsFile.model_validate(content)
         firmware = _version("fw_version", file.fw_version, "0.6.11")

@@ -302,7 +302,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         winch = self._rig.winches[number]
         return SimulatedOdrive(
             winch.node_id,
-            _settings(self._document),
+            _settings(self._document, self._layouts),
             self._layouts,
             winch.counts_per_turn,
             self._document.motor_torque_constant_nm_a,
@@ -340,7 +340,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
             drive.receive(command, message.data)
 
 
-def _settings(document: OdriveDocument) -> OdriveSettings:
+def _settings(document: OdriveDocument, layouts: Layouts) -> OdriveSettings:
     """Settings as if the rig file's values had been written with odrivetool."""
     watchdog = document.watchdog_ms
     settings = OdriveSettings(
@@ -350,6 +350,6 @@ def _settings(document: OdriveDocument) -> OdriveSettings:
         torques=document.torques_ms / 1000.0,
     )
     if document.endpoints is not None:
-        known = read_endpoints(Path(document.endpoints), document)
+        known = read_endpoints(Path(document.endpoints), document, layouts)
         settings.firmware, settings.board = known.firmware, known.board
     return settings

@@ -537,7 +537,7 @@ def test_settings_are_written_and_read_back_with_the_endpoints_of_the_firmware(
     with odrive_bench(rig) as bench:
         assert bench.group.configure() == ()
         document: Any = rig.document.drives
-        known = read_endpoints(file, document)
+        known = read_endpoints(file, document, read_layouts())
         for drive in bench.drives:
             for wanted in wanted_settings(document, read_layouts()):
                 endpoint = known.by_name[wanted.name]
@@ -562,7 +562,7 @@ def test_drives_scale_feed_forward_as_the_dbc_file_does(
     dbc = dbc_with_steps(tmp_path / "steps.dbc", speed, torque)
     file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
     rig = odrive_rig(endpoints=str(file), dbc=str(dbc))
-    known = read_endpoints(file, odrive_of(rig)).by_name
+    known = read_endpoints(file, odrive_of(rig), read_layouts(dbc)).by_name
     with odrive_bench(rig) as bench:
         bench.group.configure()
         written = tuple(
@@ -580,7 +580,7 @@ def test_steps_that_no_scale_of_a_drive_gives_are_refused(tmp_path: Path, step: 
     dbc = dbc_with_steps(tmp_path / "steps.dbc", step, "0.001")
     file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
     with pytest.raises(BadInput, match="Vel_FF"):
-        read_endpoints(file, odrive_of(odrive_rig(dbc=str(dbc))))
+        read_endpoints(file, odrive_of(odrive_rig(dbc=str(dbc))), read_layouts(dbc))
 
 
 def test_a_setting_that_is_not_kept_is_refused_with_drive_and_endpoint(tmp_path: Path) -> None:
@@ -628,7 +628,7 @@ def test_endpoints_of_no_stated_board_are_refused_in_one_sentence(tmp_path: Path
     del content["hw_version"]
     file.write_text(json.dumps(content))
     with pytest.raises(BadInput) as caught:
-        read_endpoints(file, odrive_of(odrive_rig()))
+        read_endpoints(file, odrive_of(odrive_rig()), read_layouts())
     assert caught.value.what == "the file does not state its board: it has no hw_version"
     assert "flat_endpoints.json" in caught.value.next_step
 
@@ -657,7 +657,7 @@ def test_a_file_that_holds_no_endpoints_is_refused(tmp_path: Path, text: str) ->
     path = tmp_path / "endpoints.json"
     path.write_text(text)
     with pytest.raises(BadInput, match=r"lacks required endpoints|not valid JSON|finite") as caught:
-        read_endpoints(path, document)
+        read_endpoints(path, document, read_layouts())
     assert "Error(" not in str(caught.value), "no error of a library"
 
 
@@ -672,7 +672,7 @@ def test_a_firmware_without_a_required_setting_is_refused_by_both_names(
     del content["endpoints"][name]
     path.write_text(json.dumps(content))
     with pytest.raises(BadInput) as caught:
-        read_endpoints(path, document)
+        read_endpoints(path, document, read_layouts())
     assert caught.value.what == f"the file lacks required endpoints: {name}"
     assert "firmware 0.6.3-1" in caught.value.why
     assert "leave out drives.endpoints" in caught.value.next_step
@@ -684,7 +684,7 @@ def test_an_endpoint_of_an_unknown_type_is_named(tmp_path: Path) -> None:
     path.write_text(path.read_text().replace('"bool"', '"endpoint_ref"'))
     words = "axis0.config.enable_watchdog has the type 'endpoint_ref'"
     with pytest.raises(BadInput, match=words):
-        read_endpoints(path, document)
+        read_endpoints(path, document, read_layouts())
 
 
 def test_errors_are_reset_on_all_drives_and_only_while_none_holds_by_torque(

@@ -54,6 +54,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     rig = load_rig(corpus["rig"][0])
     small = replace(rig.cameras[0], width=64, height=48)
     bus = BusSettings("virtual", "fuzz")
+    layouts = read_layouts()
     odrive = OdriveDocument(type="odrive", motor_torque_constant_nm_a=0.05, watchdog_ms=50.0)
     calls: dict[str, Callable[[Path], object]] = {
         "rig": load_rig,
@@ -69,7 +70,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "latch": lambda path: _at(FaultLatch(bus), path).read(),
         "video": lambda path: sum(1 for _ in VideoFile(path, small)),
         "picture": read_picture,
-        "endpoints": lambda path: read_endpoints(path, odrive),
+        "endpoints": lambda path: read_endpoints(path, odrive, layouts),
         "dbc": read_layouts,
         "eds": read_eds.__wrapped__,
         "taught": TaughtPoses,
