@@ -72,8 +72,7 @@ class ImageFolder:
         """Yields the images that have the camera's size.
 
         Raises:
-            BadInput: None can be read, or none has the camera's size; one has to be rotated, and
-                the camera has a rolling shutter.
+            BadInput: None can be read or has the camera's size, or as `Camera.require_unrotated`.
         """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
@@ -196,10 +195,9 @@ def _read(path: Path, size: tuple[int, int] | None) -> tuple[Image | None, bool]
 
 def _data(path: Path) -> bytes:
     """The content of a file; empty if it cannot be read."""
-    try:
+    with suppress(BadInput):
         return read_bytes(path, PICTURE_LIMIT)
-    except BadInput:
-        return b""
+    return b""
 
 
 def _most_frequent(images: Sequence[tuple[tuple[int, int], int]]) -> tuple[int, int]:
@@ -436,8 +434,7 @@ class ImageOutput:
     def _to_video(self, picture: NDArray[np.uint8]) -> None:
         if self._video is None:
             code = cv2.VideoWriter.fourcc(*VIDEO_CODES[self._path.suffix.lower()])
-            size = (picture.shape[1], picture.shape[0])
-            self._video = cv2.VideoWriter(str(self._unfinished), code, self._rate, size)
+            self._video = cv2.VideoWriter(str(self._unfinished), code, self._rate, _size(picture))
             if not self._video.isOpened():
                 raise _unwritable(self._path, "OpenCV has no encoder for this video format")
         self._video.write(picture)
