@@ -21,7 +21,7 @@ from calibration.intrinsics.calibrate import fit_camera
 from calibration.intrinsics.lens import LENSES
 from calibration.intrinsics.quality import judge_camera
 from calibration.targets.boards import Chessboard
-from tests.calibration.board_pictures import (
+from tests.calibration.board_images import (
     DISTORTION,
     MATRIX,
     SIZE,

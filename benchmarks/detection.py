@@ -28,7 +28,7 @@ from model.rig import Camera, load_rig
 from model.scene import load_scene
 from model.tag_families import tags_in
 from simulation.camera.camera import SyntheticCamera
-from tests.tracking.hard_pictures import Condition, HardPicture, HardPrinter
+from tests.tracking.hard_images import Condition, HardImage, HardPrinter
 from tracking.camera_model import Image, distort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.detection.tags import dictionary, modules_across, upright_corners
@@ -124,7 +124,7 @@ class Score:
     square: float = 0.0
     seconds: float = 0.0
 
-    def add(self, found: Mapping[int, Array], picture: HardPicture, side_px: float) -> None:
+    def add(self, found: Mapping[int, Array], picture: HardImage, side_px: float) -> None:
         """Counts one image."""
         self.pictures += 1
         self.false += sum(number != picture.number for number in found)
@@ -169,7 +169,7 @@ def table(family: str, count: int, seed: int) -> bool:
             scores = {who: Score() for who in finders}
             rng = np.random.default_rng([seed, len(label), int(condition.side_px)])
             for _ in range(count):
-                picture = printer.picture(replace(condition), rng)
+                picture = printer.image(replace(condition), rng)
                 for who, find in finders.items():
                     found = find(picture.image, picture.number)
                     scores[who].add(found, picture, condition.side_px)

@@ -23,6 +23,15 @@ from calibration.geometry.parameters import DEFAULT_DEVIATIONS, checked_deviatio
 from calibration.geometry.quality import RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
+from calibration.images import (
+    DEFAULT_IMAGES,
+    DEFAULT_TAG_IMAGES,
+    ImageSet,
+    ImageSource,
+    open_images,
+    open_source,
+    open_timed_images,
+)
 from calibration.intrinsics.calibrate import (
     CameraCalibration,
     fit_camera,
@@ -40,22 +49,13 @@ from calibration.intrinsics.readout import (
     readout_result,
 )
 from calibration.intrinsics.result import CameraResult, camera_page, camera_result
-from calibration.pictures import (
-    DEFAULT_IMAGES,
-    DEFAULT_TAG_IMAGES,
-    ImageSet,
-    ImageSource,
-    open_images,
-    open_source,
-    open_timed_images,
-)
 from calibration.results import (
     Calibration,
     CalibrationVerdict,
     Destination,
     require_file_name,
 )
-from calibration.run_data import poses_by_picture, rig_measurements
+from calibration.run_data import poses_by_image, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
 from calibration.tag_map.observations import observe_tags
 from calibration.tag_map.result import (
@@ -215,7 +215,7 @@ def locate_camera(
     if poses is None or isinstance(poses, Mapping):
         known = poses
     else:
-        known = poses_by_picture(path_of(poses), taken_by.name)
+        known = poses_by_image(path_of(poses), taken_by.name)
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags

@@ -23,7 +23,7 @@ from model.pose import Pose, interpolate, matrix_from_quaternion
 from model.rig import Rig
 
 
-def poses_by_picture(path: Path, camera: str) -> Mapping[str, Pose]:
+def poses_by_image(path: Path, camera: str) -> Mapping[str, Pose]:
     """Platform poses by image, from a CSV file or the encoders of a run folder.
 
     Raises:

@@ -245,7 +245,7 @@ def track_sources(
                 result.count,
                 give_up_after=PATIENCE if length is None and not several else None,
                 model=model,
-                on_picture=draw,
+                on_image=draw,
             )
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
@@ -446,4 +446,4 @@ def _rendered(
 ) -> Iterable[SourceImage]:
     film = ImageSequence(make_synthetic_camera(rig, scene, camera))
     for number, (at, pose) in enumerate(timed_poses):
-        yield Frame(at, film.picture(at, pose, number), f"rendered {number}", number)
+        yield Frame(at, film.image(at, pose, number), f"rendered {number}", number)

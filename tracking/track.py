@@ -75,7 +75,7 @@ def track(
     count: TrackCount | None = None,
     give_up_after: int | None = None,
     model: ClearanceModel | None = None,
-    on_picture: Callable[[SourceImage, LoggedImage], None] | None = None,
+    on_image: Callable[[SourceImage, LoggedImage], None] | None = None,
 ) -> Iterator[LoggedImage]:
     """Measures the images of a source one by one.
 
@@ -85,7 +85,7 @@ def track(
         count: Updated with each image.
         give_up_after: Ends an endless source after this many images without any pose.
         model: Of the obstacles, to measure the clearance as well.
-        on_picture: Called with each image and its measurement.
+        on_image: Called with each image and its measurement.
 
     Raises:
         NoPlatformSeen: At the end, if no image gave a pose.
@@ -112,8 +112,8 @@ def track(
             seen.update(observation.seen)
             last = picture
         logged = LoggedImage(picture.name, observation, clearance, picture.number)
-        if on_picture is not None:
-            on_picture(picture, logged)
+        if on_image is not None:
+            on_image(picture, logged)
         yield logged
         if count.poses == 0 and count.pictures == give_up_after:
             break

@@ -26,7 +26,7 @@ import ompl_runs
 import ours
 from checkers import EdgeCheck, FclStates, exact_edges
 from claims import claims
-from pictures import curves_figure
+from figures import curves_figure
 from result import Result
 from rich.progress import Progress
 

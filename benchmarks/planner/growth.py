@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 import ours
-from pictures import growth_figure
+from figures import growth_figure
 from rich.progress import track
 
 from model.files.scene_file import SceneDocument

@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-from pictures import pareto_figure
+from figures import pareto_figure
 from reference import LIGHT, Question, question, reference_of
 from rich.progress import track
 

@@ -26,14 +26,14 @@ from calibration.extrinsics.result import (
     widths_of,
     workspace_corners,
 )
-from calibration.intrinsics.calibrate import NOT_FOUND
-from calibration.pictures import (
+from calibration.images import (
     DEFAULT_IMAGES,
     ImageSet,
     ImageSource,
     open_source,
     same_images,
 )
+from calibration.intrinsics.calibrate import NOT_FOUND
 from calibration.procedures import ExtrinsicsOutcome
 from calibration.results import Calibration, Destination, Issue, data_hash
 from calibration.statistics import duplicate_reason, has_not_moved

@@ -164,7 +164,7 @@ def radial_pattern(result: CameraCalibration) -> str:
     return drawing(shapes, (_WIDTH, 232.0), label)
 
 
-def worst_picture(result: CameraCalibration) -> Sequence[Section]:
+def worst_image(result: CameraCalibration) -> Sequence[Section]:
     """The image with the largest error and the fitted board; empty without images."""
     name = max(result.view_errors, key=lambda key: result.view_errors[key])
     image = result.previews.get(name)
@@ -388,7 +388,7 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
             Section("Uncertainty of pixels", uncertainty_figure(result, quality), sure),
             Section("Errors of corners", residual_arrows(result), arrows),
             Section("Radial errors", radial_pattern(result), along),
-            *worst_picture(result),
+            *worst_image(result),
             Section("Tilt of the board", tilt_figure(quality), tilted),
             Section("Images used", _image_table(result), used),
             Section("Images not used", table_of(result.unused.items())),

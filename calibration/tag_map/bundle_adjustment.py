@@ -174,7 +174,7 @@ def _groups(pictures: Iterable[frozenset[int]]) -> list[set[int]]:
     return groups
 
 
-LEAST_PICTURES = 4
+LEAST_IMAGES = 4
 """Images of two tags or more; twenty are good."""
 
 
@@ -274,12 +274,12 @@ def measure_layout(
     starts, observations = initial_poses(camera, nominal, observations)
     located = connected_tags([tuple(squares) for squares in observations.squares.values()], fixed)
     used = _only_located(observations, located, fixed)
-    if len(used.squares) < LEAST_PICTURES:
+    if len(used.squares) < LEAST_IMAGES:
         raise _too_few(used, fixed)
     tags = tuple(nominal[number] for number in located)
     views = TagViews.of(camera, used, tags)
     fit = adjust_bundle(views, [starts[name] for name in used.squares], tags)
-    if outliers := outlier_image(used, views.picture_errors(*fit)):
+    if outliers := outlier_image(used, views.image_errors(*fit)):
         return measure_layout(rig, camera, observations.without(outliers), fixed)
     unseen = {
         number: _unseen_reason(number, observations, located)
@@ -341,7 +341,7 @@ def _result(
         covariance=read_only(covariance),
         half_widths=read_only(widths_of(covariance, without)),
         fixed=fixed,
-        errors=dict(zip(observations.squares, views.picture_errors(cameras, tags), strict=True)),
+        errors=dict(zip(observations.squares, views.image_errors(cameras, tags), strict=True)),
         seen={tag.id: numbers.count(tag.id) for tag in tags},
         unseen=unseen,
         sides=_sides(cameras),
@@ -363,7 +363,7 @@ def _too_few(observations: TagObservations, fixed: int | None) -> BadInput:
     together = f", linked to tag {fixed}" if fixed is not None else ""
     return BadInput(
         f"{len(observations.squares)} images show two platform tags or more{together};"
-        f" {LEAST_PICTURES} are required",
+        f" {LEAST_IMAGES} are required",
         why=reasons,
         next_step="take 20 images from all sides, two or three tags in each",
     )

@@ -276,7 +276,7 @@ class TagViews:
         freedom = errors.size - 6 * len(cameras) - 6 * (len(tags) - 1)
         return informations, scores, float(np.sum(errors**2)) / max(freedom, 1)
 
-    def picture_errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> list[float]:
+    def image_errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> list[float]:
         """RMS corner error of each image, [px]."""
         points, _, _ = self._points(cameras, tags)
         pixels = project_undistorted(self.camera, points).reshape(-1, 8)

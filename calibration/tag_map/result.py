@@ -241,7 +241,7 @@ def _pose_rows(document: TagsResult) -> list[tuple[str, ...]]:
 # Verdict.
 
 
-GOOD_PICTURES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
+GOOD_IMAGES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
 """Required images in all, images of each tag, and reprojection error [px]."""
 GOOD_SIDES_DEG = 40.0
 GOOD_SCALE = 0.02
@@ -267,8 +267,8 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
 
 def _image_issues(result: TagLayout) -> list[Issue]:
     issues = []
-    if len(result.errors) < GOOD_PICTURES:
-        what = f"{len(result.errors)} images show two tags or more; {GOOD_PICTURES} are required"
+    if len(result.errors) < GOOD_IMAGES:
+        what = f"{len(result.errors)} images show two tags or more; {GOOD_IMAGES} are required"
         issues.append(Issue(what, "take 20 images from all sides, two or three tags in each"))
     if np.degrees(result.sides) < GOOD_SIDES_DEG:
         what = (

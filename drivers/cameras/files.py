@@ -18,22 +18,22 @@ from numpy.typing import NDArray
 from drivers.cameras.live import Frame, Image, eight_bits
 from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
-from model.files.reading import PICTURE_LIMIT, files_in, is_folder, is_too_large, read_bytes
+from model.files.reading import IMAGE_LIMIT, files_in, is_folder, is_too_large, read_bytes
 from model.rig import Camera
 
 #: Suffixes of image files, in lower case.
-PICTURE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
 #: An EXIF block begins within so many bytes and is no longer, [bytes].
 EXIF_WITHIN = 65536
 _GREY_LEVELS = (np.uint8, np.uint16)
 _ON_ITS_SIDE = range(5, 9)  # EXIF orientations that swap width and height
-_NO_PICTURE, _CAMERA = "is not a readable image", "the camera has"
+_NO_IMAGE, _CAMERA = "is not a readable image", "the camera has"
 
 
 class ImageFolder:
     """The images of a folder in natural order of their names.
 
-    They are rotated by the rule of `read_picture`, as in a calibration.
+    They are rotated by the rule of `read_image`, as in a calibration.
 
     Args:
         folder: Folder of the images.
@@ -58,8 +58,8 @@ class ImageFolder:
         rate: float | None = None,
         on_unused: Callable[[str, str], None] | None = None,
     ) -> None:
-        self.files = picture_files(folder)
-        self.names = tuple(picture_name(path) for path in self.files)
+        self.files = image_files(folder)
+        self.names = tuple(image_name(path) for path in self.files)
         self.unused: dict[str, str] = {}
         self._folder, self._camera = folder, camera
         self.rate = rate or camera.rate
@@ -95,7 +95,7 @@ class ImageFolder:
 
 
 class SingleCameraImages:
-    """The images of a folder with one size, rotated by the rule of `read_picture`.
+    """The images of a folder with one size, rotated by the rule of `read_image`.
 
     Files that cannot be used are listed in `unused`.
 
@@ -117,11 +117,11 @@ class SingleCameraImages:
         self.unused: dict[str, str] = {}
         sizes: dict[Path, tuple[int, int]] = {}
         orientations: list[int] = []
-        for path in picture_files(folder):
+        for path in image_files(folder):
             data = _data(path)
             image = _decoded(data)
             if image is None:
-                self.unused[picture_name(path)] = _unreadable(path)
+                self.unused[image_name(path)] = _unreadable(path)
             else:
                 sizes[path] = _size(image)
                 orientations.append(exif_orientation(data))
@@ -129,10 +129,10 @@ class SingleCameraImages:
             raise _no_picture(folder, self.unused)
         self.size = wanted or _most_frequent([*zip(sizes.values(), orientations, strict=True)])
         for path, size in sizes.items():
-            if size != self.size and _size(read_picture(path, self.size)) != self.size:
+            if size != self.size and _size(read_image(path, self.size)) != self.size:
                 owner = _CAMERA if wanted else "most have"
-                self.unused[picture_name(path)] = _other_size(size, owner, self.size)
-        named = {picture_name(path): path for path in sizes}
+                self.unused[image_name(path)] = _other_size(size, owner, self.size)
+        named = {image_name(path): path for path in sizes}
         self._files = {name: path for name, path in named.items() if name not in self.unused}
         if not self._files:
             raise _wrong_sizes(folder, self.unused, self.size)
@@ -141,12 +141,12 @@ class SingleCameraImages:
     def __iter__(self) -> Iterator[tuple[str, Image]]:
         """Yields names and grey images."""
         for name, path in self._files.items():
-            image = read_picture(path, self.size)
+            image = read_image(path, self.size)
             if image is not None and _size(image) == self.size:
                 yield name, image
 
 
-def picture_files(folder: Path) -> tuple[Path, ...]:
+def image_files(folder: Path) -> tuple[Path, ...]:
     """The files of a folder with an image suffix, in natural order of their names.
 
     Raises:
@@ -154,22 +154,22 @@ def picture_files(folder: Path) -> tuple[Path, ...]:
     """
     if not is_folder(folder):
         raise BadInput("no such folder", where=str(folder), next_step="check the path")
-    found = [p for p in files_in(folder) if p.suffix.lower() in PICTURE_ENDINGS]
+    found = [p for p in files_in(folder) if p.suffix.lower() in IMAGE_ENDINGS]
     if not found:
         raise BadInput(
             "the folder has no images",
             where=str(folder),
-            next_step=f"name a folder with files ending in {', '.join(PICTURE_ENDINGS)}",
+            next_step=f"name a folder with files ending in {', '.join(IMAGE_ENDINGS)}",
         )
-    return tuple(sorted(found, key=lambda path: natural_order(picture_name(path))))
+    return tuple(sorted(found, key=lambda path: natural_order(image_name(path))))
 
 
-def picture_name(path: Path) -> str:
+def image_name(path: Path) -> str:
     """The name of an image's file; bytes that are not UTF-8 are escaped, as in a log."""
     return path.name.encode(errors="backslashreplace").decode()
 
 
-def read_picture(path: Path, size: tuple[int, int] | None = None) -> Image | None:
+def read_image(path: Path, size: tuple[int, int] | None = None) -> Image | None:
     """The grey image of a file, or None if it has none; also for names that OpenCV cannot open.
 
     It is as the sensor stored it, like that of a live camera: a camera that points down states its
@@ -184,7 +184,7 @@ def read_picture(path: Path, size: tuple[int, int] | None = None) -> Image | Non
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> tuple[Image | None, bool]:
-    """The image as for `read_picture`, and whether it was rotated."""
+    """The image as for `read_image`, and whether it was rotated."""
     data = _data(path)
     image = _decoded(data)
     if image is None or size in (None, _size(image)):
@@ -196,7 +196,7 @@ def _read(path: Path, size: tuple[int, int] | None) -> tuple[Image | None, bool]
 def _data(path: Path) -> bytes:
     """The content of a file; empty if it cannot be read."""
     with suppress(BadInput):
-        return read_bytes(path, PICTURE_LIMIT)
+        return read_bytes(path, IMAGE_LIMIT)
     return b""
 
 
@@ -232,7 +232,7 @@ def _unreadable(path: Path) -> str:
     """Why a file is not used."""
     picture = _raw(_data(path))
     if picture is None:
-        return _NO_PICTURE
+        return _NO_IMAGE
     return f"has values of type {picture.dtype}; only integers of 8 to 16 bits can be used"
 
 

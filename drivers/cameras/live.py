@@ -33,7 +33,7 @@ from model.rig import Camera
 
 
 #: Consecutive failed reads after which a camera counts as lost.
-LOST_PICTURES = 5
+LOST_IMAGES = 5
 #: The same after copies of one image for this long, [s]. A video codec may repeat an image of a
 #: platform at rest up to its next complete one, for 10 s and more.
 FROZEN = 60.0
@@ -126,8 +126,8 @@ class FrameReader:
             good, picture = capture.read()
             now = self._clock()
             failed = 0 if good else failed + 1
-            if failed == LOST_PICTURES:
-                self.lost = f"failed to deliver an image {LOST_PICTURES} times in a row"
+            if failed == LOST_IMAGES:
+                self.lost = f"failed to deliver an image {LOST_IMAGES} times in a row"
             if not good:
                 continue
             arrived = Arrived(number, now, np.asarray(picture))

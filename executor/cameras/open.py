@@ -184,13 +184,13 @@ class RenderedImages:
         self._film, self._latency, self._true_latency = film, latency, true_latency
         self._poses: list[tuple[float, Pose]] = []
 
-    def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
+    def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """Renders the platform at its true pose, of the true latency ago."""
         if trigger.true_pose is None:
             raise Fault("the synthetic camera has no platform pose")
         self._poses.append((trigger.time, trigger.true_pose))
         exposed = trigger.time - self._true_latency
-        image = self._film.picture(exposed, self._pose_at(exposed), trigger.frame)
+        image = self._film.image(exposed, self._pose_at(exposed), trigger.frame)
         return image, -self._latency
 
     def _pose_at(self, time: float) -> Pose:
@@ -214,7 +214,7 @@ class LiveImages:
         """Uses an open camera."""
         self._camera = camera
 
-    def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
+    def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """The next image, and the middle of its exposure after the request, [s]."""
         frame = self._camera.read()
         return frame.image, frame.time - trigger.asked

@@ -77,7 +77,7 @@ def sample_without_pose(frame: int, time: float, reason: str) -> CameraSample:
 class ImageSource(Protocol):
     """A camera, real or rendered, that delivers images on request."""
 
-    def picture(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
+    def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """A grey image, and the middle of its exposure after the request, [s]."""
         ...
 
@@ -143,10 +143,10 @@ class CameraWorker:
 
     def measure(self, trigger: FrameRequest) -> CameraSample:
         """Takes an image and measures the platform pose in it."""
-        image, delay = self._source.picture(trigger)
+        image, delay = self._source.image(trigger)
         name = ""
         if self._folder is not None and trigger.frame % self._keep_every == 0:
-            name = self._folder.write_picture(trigger.frame, image, self._name)
+            name = self._folder.write_image(trigger.frame, image, self._name)
             self._kept += 1
             if self._kept % KEPT_IMAGES == 0:
                 self._keep_every *= 2

@@ -85,13 +85,13 @@ def _pictures(
     folder: RunFolder, poses: PoseTable, start: int, camera: str = ""
 ) -> Iterator[Message]:
     for time, name in zip(poses.time.tolist(), poses.picture, strict=True):
-        if name and folder.has_picture(name):
+        if name and folder.has_image(name):
             picture = partial(_picture, folder, name, stamp_of(start, time), frame_of(camera))
             yield topic_of("/pictures", camera), time, picture
 
 
 def _picture(folder: RunFolder, name: str, stamp: Timestamp, frame: str) -> CompressedImage:
-    data = folder.picture(name)
+    data = folder.image(name)
     return CompressedImage(timestamp=stamp, frame_id=frame, data=data, format="jpeg")
 
 

@@ -32,7 +32,7 @@ from executor.recording.tables import CycleTable, FusedTable, PoseTable
 from model.errors import BadInput, Fault, InvalidFile
 from model.files.documents import write_atomic
 from model.files.plan_file import PlanDocument
-from model.files.reading import PICTURE_LIMIT, read_bytes, read_json
+from model.files.reading import IMAGE_LIMIT, read_bytes, read_json
 from model.files.rig_file import RigDocument
 from model.files.validation import problems_of
 from model.plan import Plan, load_plan, save_plan
@@ -375,7 +375,7 @@ class RunFolder:
         """
         write_atomic(self.path / EVENTS, "".join(event.line for event in events))
 
-    def write_picture(self, frame: int, image: NDArray[np.uint8], camera: str = "") -> str:
+    def write_image(self, frame: int, image: NDArray[np.uint8], camera: str = "") -> str:
         """Keeps a camera image, grey or BGR, as JPEG.
 
         Args:
@@ -403,12 +403,12 @@ class RunFolder:
             raise self._not_written(name, error) from None
         return name
 
-    def has_picture(self, name: str) -> bool:
+    def has_image(self, name: str) -> bool:
         """Whether an image that was kept still exists; archives often lack them."""
         return os.path.isfile(self.path / name)  # False for a name that cannot be a path
 
-    def picture(self, name: str) -> bytes:
-        """The JPEG of a name from `write_picture`.
+    def image(self, name: str) -> bytes:
+        """The JPEG of a name from `write_image`.
 
         Raises:
             BadInput: It does not exist, or is not in the folder of images.
@@ -417,7 +417,7 @@ class RunFolder:
             file = (self.path / name).resolve()
             if not file.is_relative_to((self.path / PICTURES).resolve()):
                 raise FileNotFoundError(0, f"it is not in {PICTURES}")
-            return read_bytes(file, PICTURE_LIMIT)
+            return read_bytes(file, IMAGE_LIMIT)
         except OSError as error:
             what, why = "the image cannot be read", error.strerror or str(error)
             raise BadInput(what, where=str(self.path / name), why=why) from None

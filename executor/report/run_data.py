@@ -79,7 +79,7 @@ def missing_images(folder: RunFolder, tables: Iterable[PoseTable]) -> str:
         tables: Its poses, and those of each of several cameras.
     """
     kept = {name for table in tables for name in table.picture if name}
-    missing = sum(not folder.has_picture(name) for name in kept)
+    missing = sum(not folder.has_image(name) for name in kept)
     return f"images missing from {PICTURES}/: {missing} of {len(kept)}" if missing else ""
 
 

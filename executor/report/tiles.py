@@ -335,7 +335,7 @@ def frames(run: RunData) -> str:
     missing = missing_images(run.folder, (run.poses, *run.alone.values()))
     note = paragraph(f"{missing[0].upper()}{missing[1:]}.") if missing else ""
     names = run.poses.picture
-    kept = [i for i, name in enumerate(names) if name and run.folder.has_picture(name)]
+    kept = [i for i, name in enumerate(names) if name and run.folder.has_image(name)]
     if not kept:
         return note
     indices = np.unique(np.linspace(0, len(kept) - 1, min(COUNT, len(kept))).astype(int))
@@ -346,7 +346,7 @@ def frames(run: RunData) -> str:
 def _figure(run: RunData, row: int) -> str:
     poses = run.poses
     time = f"{float(poses.time[row]):.1f} s"
-    data = base64.b64encode(_smaller(run.folder.picture(poses.picture[row]))).decode()
+    data = base64.b64encode(_smaller(run.folder.image(poses.picture[row]))).decode()
     return (
         f'<figure><img src="data:image/jpeg;base64,{data}" alt="Camera image after {time}">'
         f"<figcaption><b>{time}</b> {prose(_clearance_frame(run, row))}<br>"

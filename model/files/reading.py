@@ -24,7 +24,7 @@ TEXT_LIMIT = 256 * MEGABYTE
 """Largest text file that a user names, [bytes]."""
 YAML_LIMIT = 1 * MEGABYTE
 """Largest YAML file, [bytes]; its parser needs several seconds for that."""
-PICTURE_LIMIT = 256 * MEGABYTE
+IMAGE_LIMIT = 256 * MEGABYTE
 """Largest image file, [bytes]."""
 
 

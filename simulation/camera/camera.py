@@ -183,7 +183,7 @@ class ImageSequence:
         self._camera = camera
         self._before: tuple[float, Pose] | None = None
 
-    def picture(self, time: float, pose: Pose, frame: int) -> Image8:
+    def image(self, time: float, pose: Pose, frame: int) -> Image8:
         """The next image.
 
         Args:

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calibration.images import ImageSet
 from calibration.intrinsics.calibrate import fit_camera
-from calibration.pictures import ImageSet
 from calibration.procedures import calibrate_camera
 from calibration.statistics import EvenSample
 from calibration.targets.boards import Charuco, Chessboard, DetectedBoard, is_mirrored
@@ -22,7 +22,7 @@ from calibration.targets.grids import CircleGrid, TagGrid
 from model.cameras import generic_camera
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector
-from tests.calibration.board_pictures import (
+from tests.calibration.board_images import (
     DISTORTION,
     MATRIX,
     SIZE,

@@ -28,7 +28,7 @@ from model.cameras import Z_95
 from model.errors import BadInput
 from model.files.camera_file import LensCovariance
 from model.pose import Array, Pose, matrix_from_rotation_vector
-from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, sample_rays
+from tests.calibration.board_images import DISTORTION, MATRIX, SIZE, sample_rays
 
 BOARD = Chessboard(9, 6, 0.025)
 

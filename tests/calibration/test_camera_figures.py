@@ -16,10 +16,10 @@ from calibration.intrinsics.result import (
     radial_pattern,
     residual_arrows,
     uncertainty_figure,
-    worst_picture,
+    worst_image,
 )
 from calibration.targets.boards import Chessboard
-from tests.calibration.board_pictures import picture_of, poses_before_the_camera, with_noise
+from tests.calibration.board_images import picture_of, poses_before_the_camera, with_noise
 from tests.calibration.test_lens_models import SIZE, TRUTH, views
 
 BOARD = Chessboard(9, 6, 0.02)
@@ -97,7 +97,7 @@ def test_a_radial_pattern_is_seen_where_the_model_is_wrong(lens: str) -> None:
 
 
 def test_the_worst_image_is_on_the_page_with_its_board(photographed) -> None:
-    [shown] = worst_picture(photographed)
+    [shown] = worst_image(photographed)
     name = max(photographed.view_errors, key=lambda key: photographed.view_errors[key])
     assert name in shown.note
     data = re.search(r"data:image/jpeg;base64,([^\"]+)", shown.body)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.pictures import VIDEO_IMAGES, CaptureGuide, open_images, open_source, same_images
+from calibration.images import VIDEO_IMAGES, CaptureGuide, open_images, open_source, same_images
 from calibration.targets.boards import Chessboard, DetectedBoard
 from drivers.cameras.live import VideoFile
 from model.cameras import generic_camera

@@ -11,7 +11,7 @@ import pytest
 from calibration.intrinsics.calibrate import CameraCalibration, fit_camera
 from calibration.intrinsics.quality import judge_camera
 from calibration.targets.boards import Charuco, Chessboard
-from drivers.cameras.files import SingleCameraImages, read_picture
+from drivers.cameras.files import SingleCameraImages, read_image
 from tests.calibration.exif import jpeg, rotated_by_exif
 from tracking.detection.detector import TagDetector
 
@@ -25,7 +25,7 @@ def chessboards() -> list[Path]:
 
 @pytest.fixture(scope="module")
 def found() -> CameraCalibration:
-    return fit_camera([(p.name, read_picture(p)) for p in chessboards()], BOARD)
+    return fit_camera([(p.name, read_image(p)) for p in chessboards()], BOARD)
 
 
 def test_a_real_camera_is_calibrated_from_thirteen_photographs(found: CameraCalibration) -> None:
@@ -59,7 +59,7 @@ def test_every_board_is_found_that_any_finder_of_opencv_finds(factor: float) -> 
     exhaustive = cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_EXHAUSTIVE
     for path in chessboards():
         image = cv2.resize(
-            read_picture(path), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA
+            read_image(path), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA
         )
         theirs = (
             cv2.findChessboardCorners(image, (9, 6))[0]
@@ -72,7 +72,7 @@ def test_every_board_is_found_that_any_finder_of_opencv_finds(factor: float) -> 
 
 def test_rotated_and_coloured_photographs_show_the_same(tmp_path: Path) -> None:
     """JPEG rotated by EXIF, and PNG in colour."""
-    grey = read_picture(chessboards()[0])
+    grey = read_image(chessboards()[0])
     (tmp_path / "a.jpg").write_bytes(rotated_by_exif(grey))
     cv2.imwrite(str(tmp_path / "b.png"), cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR))
     expected = BOARD.find(grey).corners
@@ -85,7 +85,7 @@ def test_orientations_that_change_between_images_are_those_of_a_camera_that_poin
     tmp_path: Path,
 ) -> None:
     """Turned by 180° an image has the same size, but another principal point."""
-    grey = read_picture(chessboards()[0])
+    grey = read_image(chessboards()[0])
     for name, orientation in (("a", 1), ("b", 3)):
         (tmp_path / f"{name}.jpg").write_bytes(jpeg(grey, orientation))
     one, other = (image for _, image in SingleCameraImages(tmp_path))
@@ -96,7 +96,7 @@ def test_orientations_that_change_between_images_are_those_of_a_camera_that_poin
 
 
 def test_corners_are_found_in_twelve_megapixels() -> None:
-    grey = read_picture(chessboards()[1])
+    grey = read_image(chessboards()[1])
     large = cv2.resize(grey, (4032, 3024), interpolation=cv2.INTER_CUBIC)
     gaps = (BOARD.find(large).corners + 0.5) / 6.3 - 0.5 - BOARD.find(grey).corners
     assert np.sqrt(np.mean(gaps**2)) < 0.15
@@ -104,7 +104,7 @@ def test_corners_are_found_in_twelve_megapixels() -> None:
 
 
 def test_a_charuco_board_in_a_colour_photograph_is_flat() -> None:
-    image = read_picture(FOLDER / "charuco.jpg")
+    image = read_image(FOLDER / "charuco.jpg")
     seen = Charuco(5, 7, 0.04, 0.02, "6X6_250").find(image)
     assert seen is not None
     assert len(seen.points) == 24
@@ -115,6 +115,6 @@ def test_a_charuco_board_in_a_colour_photograph_is_flat() -> None:
 
 
 def test_markers_in_a_colour_photograph_are_found() -> None:
-    image = read_picture(FOLDER / "markers.jpg")
+    image = read_image(FOLDER / "markers.jpg")
     assert [d.id for d in TagDetector("6X6_250").detect(image)] == [23, 40, 62, 98, 124, 203]
     assert TagDetector("tag36h11").detect(image) == []

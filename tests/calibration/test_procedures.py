@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.pictures import ImageSet, open_images
+from calibration.images import ImageSet, open_images
 from calibration.procedures import calibrate_camera
 from calibration.result_files import load_result
 from calibration.results import Destination

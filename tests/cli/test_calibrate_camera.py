@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from model.pose import Pose, matrix_from_rotation_vector
-from tests.calibration.board_pictures import MATRIX, picture_of, poses_before_the_camera, with_noise
+from tests.calibration.board_images import MATRIX, picture_of, poses_before_the_camera, with_noise
 from tests.calibration.exif import rotated_by_exif
 from tests.cli.program import call, one_message
 

@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calibration.pictures import capture_images
+from calibration.images import capture_images
 from calibration.targets.boards import Chessboard
 from model.errors import AlreadyExists
 from model.pose import Pose, matrix_from_rotation_vector
-from tests.calibration.board_pictures import SIZE, picture_of
+from tests.calibration.board_images import SIZE, picture_of
 from tests.cli.program import call, nothing_written, one_message
 from tests.cli.test_calibrate_camera import BOARD, MIDDLE, chessboard_print
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from drivers.cameras.files import ImageFolder, picture_files, read_picture
+from drivers.cameras.files import ImageFolder, image_files, read_image
 from model.errors import BadInput
 from model.rig import load_rig
 from tests.cli.plans import CONFIGS, RIG, write_short_plan
@@ -71,7 +71,7 @@ def test_poses_clearance_mcap_and_pictures_agree(plan: Path, tmp_path: Path) -> 
 
 
 def test_an_image_of_another_size_is_skipped_and_reported(tmp_path: Path) -> None:
-    for picture in picture_files(SESSION)[:2]:
+    for picture in image_files(SESSION)[:2]:
         (tmp_path / picture.name).write_bytes(picture.read_bytes())
     cv2.imwrite(str(tmp_path / "a[0].png"), np.zeros((48, 64), np.uint8))
     rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
@@ -84,7 +84,7 @@ def test_an_image_of_another_size_is_skipped_and_reported(tmp_path: Path) -> Non
 
 
 def test_mirrored_images_are_reported(tmp_path: Path) -> None:
-    grey = read_picture(picture_files(SESSION)[0])
+    grey = read_image(image_files(SESSION)[0])
     assert grey is not None
     cv2.imwrite(str(tmp_path / "a.png"), grey[:, ::-1])
     rig = CONFIGS / "gachon_8_6_rehearsal.yaml"
@@ -96,7 +96,7 @@ def test_mirrored_images_are_reported(tmp_path: Path) -> None:
 
 def test_tags_that_differ_from_the_rig_file_are_named_as_the_cause(tmp_path: Path) -> None:
     (tmp_path / "pictures").mkdir()
-    picture = picture_files(SESSION)[0]
+    picture = image_files(SESSION)[0]
     (tmp_path / "pictures" / picture.name).write_bytes(picture.read_bytes())
     rig = load_rig(CONFIGS / "gachon_8_6_rehearsal.yaml")
     tags = tuple(replace(tag, size=0.4 * tag.size) for tag in rig.platform_tags)
@@ -115,7 +115,7 @@ def test_pictures_out_of_focus_are_not_blamed_on_the_tags_sizes(
     tmp_path: Path, blur: float
 ) -> None:
     (tmp_path / "pictures").mkdir()
-    grey = read_picture(picture_files(SESSION)[0])
+    grey = read_image(image_files(SESSION)[0])
     assert grey is not None
     soft = cv2.GaussianBlur(grey, (0, 0), blur)
     cv2.imwrite(str(tmp_path / "pictures" / "a.png"), soft)
@@ -142,9 +142,9 @@ def test_a_video_is_written_with_a_frame_a_picture(plan: Path, tmp_path: Path) -
 def test_the_overlay_of_a_video_has_its_rate(tmp_path: Path) -> None:
     """Not the camera's, at which it would be shown too slowly."""
     video, drawn = tmp_path / "recorded.avi", tmp_path / "drawn.mp4"
-    size = cv2.imread(str(picture_files(SESSION)[0])).shape[1::-1]
+    size = cv2.imread(str(image_files(SESSION)[0])).shape[1::-1]
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 29.97, size)
-    for path in picture_files(SESSION)[:2]:
+    for path in image_files(SESSION)[:2]:
         writer.write(cv2.imread(str(path)))
     writer.release()
     arguments = (video, "-o", tmp_path / "poses.csv", "--overlay", drawn)

@@ -72,9 +72,7 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
     if pictures:
         rows = set(range(0, len(poses), 20))
         names = [
-            folder.write_picture(int(poses.frame[k]), picture(poses.position[k]))
-            if k in rows
-            else ""
+            folder.write_image(int(poses.frame[k]), picture(poses.position[k])) if k in rows else ""
             for k in range(len(poses))
         ]
         poses = replace(poses, picture=tuple(names))

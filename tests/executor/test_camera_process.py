@@ -50,7 +50,7 @@ def test_it_ends_without_a_word_when_its_parent_is_gone(make: Any, closed: str) 
 class Dark:
     """A camera without light."""
 
-    def picture(self, _trigger: FrameRequest) -> tuple[np.ndarray, float]:
+    def image(self, _trigger: FrameRequest) -> tuple[np.ndarray, float]:
         return np.zeros((4, 4), np.uint8), 0.0
 
 
@@ -58,7 +58,7 @@ class Dark:
 def test_a_run_on_hold_for_hours_keeps_few_images_over_all_of_it(frames: int, planned: int) -> None:
     """Each doubling of the run adds as many as its first half has."""
     kept: list[int] = []
-    folder: Any = SimpleNamespace(write_picture=lambda n, *_: kept.append(n) or "x")
+    folder: Any = SimpleNamespace(write_image=lambda n, *_: kept.append(n) or "x")
     tracker: Any = SimpleNamespace(observe=lambda *_: NoPose(0.0, "dark"))
     every = max(1, planned // KEPT_IMAGES)
     worker = CameraWorker(_RIG, _RIG.cameras[0], Dark(), folder, every, named=False)
@@ -78,7 +78,7 @@ class Film:
     def __init__(self) -> None:
         self.shown: list[tuple[float, float]] = []
 
-    def picture(self, time: float, pose: Pose, _frame: int) -> np.ndarray:
+    def image(self, time: float, pose: Pose, _frame: int) -> np.ndarray:
         self.shown.append((time, pose.position[0]))
         return np.zeros((4, 4), np.uint8)
 
@@ -89,7 +89,7 @@ def test_a_synthetic_image_shows_the_platform_of_its_latency_ago() -> None:
     source = RenderedImages(film, latency=0.05, true_latency=0.12)
     for k in range(5):
         pose = Pose.level([0.1 * k, 0.0, 0.0])
-        _, delay = source.picture(FrameRequest(k, 0.1 * k, 0.0, pose, None))
+        _, delay = source.image(FrameRequest(k, 0.1 * k, 0.0, pose, None))
         assert delay == -0.05
     expected = [(0.1 * k - 0.12, max(0.0, 0.1 * k - 0.12)) for k in range(5)]
     np.testing.assert_allclose(film.shown, expected, atol=1e-12)
@@ -99,5 +99,5 @@ def test_a_live_image_may_be_exposed_before_it_is_requested() -> None:
     camera: Any = SimpleNamespace(
         read=lambda: Frame(12.26, np.zeros((4, 4), np.uint8), "x"), close=lambda: None
     )
-    _, delay = LiveImages(camera).picture(FrameRequest(0, 1.0, 12.3, None, None))
+    _, delay = LiveImages(camera).image(FrameRequest(0, 1.0, 12.3, None, None))
     assert delay == pytest.approx(-0.04)

@@ -114,7 +114,7 @@ def test_a_image_without_a_pose_states_why_and_has_nulls(
 def test_images_are_the_jpegs_of_the_folder(folder: RunFolder, messages: Messages) -> None:
     name = next(name for name in folder.poses().picture if name)
     _, picture = messages["/pictures"][0]
-    assert picture.data == folder.picture(name)
+    assert picture.data == folder.image(name)
     assert (picture.format, picture.frame_id) == ("jpeg", "camera")
 
 
@@ -232,11 +232,11 @@ def test_one_image_at_a_time_is_in_memory(
 ) -> None:
     """A long run keeps many, of several megabytes each."""
     order: list[str] = []
-    read_picture, add_message = RunFolder.picture, Writer.add_message
+    read_image, add_message = RunFolder.image, Writer.add_message
 
     def reading(self: RunFolder, name: str) -> bytes:
         order.append("read")
-        return read_picture(self, name)
+        return read_image(self, name)
 
     def writing(self: Writer, channel: int, at: int, data: bytes, *more: int) -> None:
         if b"jpeg" in data:

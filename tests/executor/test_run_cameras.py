@@ -529,12 +529,12 @@ def test_the_names_of_the_images_name_the_camera(tmp_path: Path) -> None:
 
     folder = RunFolder.create(tmp_path / "run")
     image = np.zeros((8, 8), np.uint8)
-    names = [folder.write_picture(7, image, "side"), folder.write_picture(7, image)]
+    names = [folder.write_image(7, image, "side"), folder.write_image(7, image)]
     assert names == ["pictures/side/frame_000007.jpg", "pictures/frame_000007.jpg"]
-    assert all(folder.picture(name).startswith(b"\xff\xd8") for name in names)
+    assert all(folder.image(name).startswith(b"\xff\xd8") for name in names)
     (tmp_path / "secret").touch()
     with pytest.raises(BadInput, match="cannot be read"):
-        folder.picture("pictures/../../secret")
+        folder.image("pictures/../../secret")
 
 
 def test_the_password_of_a_camera_is_neither_sent_nor_recorded_nor_shown() -> None:

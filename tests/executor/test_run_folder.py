@@ -217,11 +217,11 @@ def test_a_broken_event_in_the_middle_is_reported_with_its_line(tmp_path: Path) 
 
 def test_a_image_comes_back_as_jpeg(tmp_path: Path) -> None:
     folder = RunFolder.create(tmp_path / "run")
-    name = folder.write_picture(7, np.full((48, 64), 99, dtype=np.uint8))
+    name = folder.write_image(7, np.full((48, 64), 99, dtype=np.uint8))
     assert name == "pictures/frame_000007.jpg"
-    assert folder.picture(name)[:2] == b"\xff\xd8"
+    assert folder.image(name)[:2] == b"\xff\xd8"
     with pytest.raises(BadInput, match="picture"):
-        folder.picture("pictures/frame_000008.jpg")
+        folder.image("pictures/frame_000008.jpg")
 
 
 def nfs_flock(flock: Callable[[int, int], None], file: IO[bytes] | int, operation: int) -> None:

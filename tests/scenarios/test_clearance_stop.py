@@ -154,7 +154,7 @@ class Rendered:
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera
 
-    def picture(self, trigger: FrameRequest) -> tuple[np.ndarray, float]:
+    def image(self, trigger: FrameRequest) -> tuple[np.ndarray, float]:
         assert trigger.true_pose is not None
         return self._camera.render(trigger.true_pose, trigger.frame), 0.0
 

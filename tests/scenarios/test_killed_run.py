@@ -184,7 +184,7 @@ def test_held_counts_only_with_the_cycles_up_to_it(killed: RunFolder, tmp_path: 
 
 def test_a_run_does_not_pass_without_what_its_cameras_measured(at_rest: RunFolder) -> None:
     at_rest.append_event(HELD)
-    at_rest.write_picture(0, np.zeros((4, 4), dtype=np.uint8))
+    at_rest.write_image(0, np.zeros((4, 4), dtype=np.uint8))
     summary = evaluate_folder(at_rest).summary
     assert (summary["verdict"], summary["final_state"]) == ("FAILED", "finished")
     assert "What the cameras measured is not on record." in summary["reasons"]

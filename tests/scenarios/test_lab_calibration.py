@@ -11,7 +11,7 @@ import pytest
 
 from calibration.targets.boards import Chessboard
 from model.pose import Pose, matrix_from_rotation_vector
-from tests.calibration.board_pictures import DISTORTION, MATRIX, SIZE, picture_of, with_noise
+from tests.calibration.board_images import DISTORTION, MATRIX, SIZE, picture_of, with_noise
 from tests.calibration.pages import drawn, pages_in
 from tests.cli.program import call
 

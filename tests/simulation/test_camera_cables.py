@@ -12,7 +12,7 @@ from model.kinematics import Cables
 from model.pose import Pose
 from simulation.camera.cables import HIDDEN, NEAR, draw_cables
 from simulation.camera.rendering import Image8, pixels_of
-from tests.tracking.tag_pictures import small_camera
+from tests.tracking.tag_images import small_camera
 
 HERE = Pose.level(np.zeros(3))
 RADIUS, WALL = 0.5e-3, 0.4

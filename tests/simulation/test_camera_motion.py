@@ -104,10 +104,10 @@ def test_a_film_smears_by_the_velocity_since_the_picture_before(
     camera = SyntheticCamera(rig, scene, facing, optics=Optics(noise=0.0, exposure=0.01))
     before = Pose(rig.home.position - [0.02, 0.0, 0.01], matrix_from_rotation_vector([0, 0, -0.05]))
     film = ImageSequence(camera)
-    assert np.array_equal(film.picture(0.0, before, 0), camera.render(before, 0))
+    assert np.array_equal(film.image(0.0, before, 0), camera.render(before, 0))
     motion = PlatformMotion(np.array([0.2, 0.0, 0.1]), np.array([0.0, 0.0, 0.5]))
-    assert np.array_equal(film.picture(0.1, rig.home, 1), camera.render(rig.home, 1, motion))
-    again = film.picture(0.1, before, 2)  # at the same time: the pose is restated, not moved
+    assert np.array_equal(film.image(0.1, rig.home, 1), camera.render(rig.home, 1, motion))
+    again = film.image(0.1, before, 2)  # at the same time: the pose is restated, not moved
     assert np.array_equal(again, camera.render(before, 2))
 
 

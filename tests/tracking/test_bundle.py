@@ -10,7 +10,7 @@ import pytest
 from model.cameras import generic_camera
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Camera, Rig, Tag
-from tests.tracking.tag_pictures import small_camera
+from tests.tracking.tag_images import small_camera
 from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from model.pose import Array
-from tests.tracking.tag_pictures import FAMILY, SIZE, TagPrinter, facing, small_camera
+from tests.tracking.tag_images import FAMILY, SIZE, TagPrinter, facing, small_camera
 from tracking.detection.detector import TagDetector
 from tracking.detection.tags import modules_across
 from tracking.edges.refine import RefinedTag, refine
@@ -25,7 +25,7 @@ def refined_errors(printer: TagPrinter, side_px: float, count: int) -> tuple[Arr
     errors, whitened = [], []
     for _ in range(count):
         pose = facing(rng, 400.0 * SIZE / side_px, tilt=0.7)
-        picture = printer.picture(pose, rng, noise=1.0)
+        picture = printer.image(pose, rng, noise=1.0)
         (found,) = detector.detect(picture.image)
         (square,) = refine(picture.image, printer.camera, found.corners[None], MODULES)
         assert square is not None
@@ -47,7 +47,7 @@ def test_corners_are_found_to_hundredths_of_a_pixel(
 
 def test_covariance_of_a_whole_tag_is_the_inverse_of_its_whitening(printer: TagPrinter) -> None:
     rng = np.random.default_rng(3)
-    picture = printer.picture(facing(rng, 0.7, 0.5), rng)
+    picture = printer.image(facing(rng, 0.7, 0.5), rng)
     square = only(printer, picture.image, picture.corners)
     np.testing.assert_allclose(
         square.whitening @ square.covariance @ square.whitening.T, np.eye(8), atol=1e-9
@@ -65,7 +65,7 @@ def test_the_result_does_not_depend_on_the_approximate_corners(
     printer: TagPrinter, shift: float
 ) -> None:
     rng = np.random.default_rng(5)
-    picture = printer.picture(facing(rng, 0.64, 0.4), rng)
+    picture = printer.image(facing(rng, 0.64, 0.4), rng)
     straight = only(printer, picture.image, picture.corners)
     shifted = only(printer, picture.image, picture.corners + shift)
     assert np.abs(straight.corners - shifted.corners).max() < 0.03
@@ -73,7 +73,7 @@ def test_the_result_does_not_depend_on_the_approximate_corners(
 
 def test_a_cable_across_an_edge_does_not_move_it(printer: TagPrinter) -> None:
     rng = np.random.default_rng(8)
-    picture = printer.picture(facing(rng, 0.64, 0.3), rng)
+    picture = printer.image(facing(rng, 0.64, 0.3), rng)
     start, end = picture.corners[0], picture.corners[1]
     middle = np.round((start + end) / 2).astype(int)
     image = picture.image.copy()
@@ -86,7 +86,7 @@ def test_a_cable_across_an_edge_does_not_move_it(printer: TagPrinter) -> None:
 
 def test_a_hidden_edge_is_left_out_and_says_nothing(printer: TagPrinter) -> None:
     rng = np.random.default_rng(9)
-    picture = printer.picture(facing(rng, 0.64, 0.1), rng)
+    picture = printer.image(facing(rng, 0.64, 0.1), rng)
     start, end = picture.corners[0], picture.corners[1]
     image = picture.image.astype(float)
     rows, columns = np.mgrid[0 : image.shape[0], 0 : image.shape[1]]
@@ -102,7 +102,7 @@ def test_a_hidden_edge_is_left_out_and_says_nothing(printer: TagPrinter) -> None
 
 def test_a_tag_that_leaves_the_picture_is_refused(printer: TagPrinter) -> None:
     rng = np.random.default_rng(1)
-    picture = printer.picture(facing(rng, 0.7, 0.1), rng)
+    picture = printer.image(facing(rng, 0.7, 0.1), rng)
     outside = picture.corners + np.array([250.0, 0.0])
     assert refine(picture.image, printer.camera, outside[None], MODULES) == [None]
 

@@ -15,8 +15,8 @@ from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene
 from model.tag_families import FAMILIES, opencv_dictionary, tags_in
 from simulation.camera.camera import SyntheticCamera
-from tests.tracking.hard_pictures import Condition, HardPrinter
-from tests.tracking.tag_pictures import FAMILY
+from tests.tracking.hard_images import Condition, HardPrinter
+from tests.tracking.tag_images import FAMILY
 from tracking.camera_model import distort_pixels
 from tracking.detection.detector import make_detector
 from tracking.detection.tags import modules_across
@@ -30,7 +30,7 @@ def test_a_printed_tag_is_found_with_its_corners_in_order(family: str) -> None:
     printer, rng = HardPrinter(family, tags_in(family)), np.random.default_rng(6)
     detector = make_detector("opencv", family)
     for _ in range(2):
-        picture = printer.picture(Condition(side_px=60), rng)
+        picture = printer.image(Condition(side_px=60), rng)
         found = {d.id: d for d in detector.detect(picture.image)}
         corners = found[picture.number].corners[None]
         (square,) = refine(picture.image, printer.camera, corners, modules_across(family))
@@ -91,7 +91,7 @@ def test_the_apriltag_library_gives_the_same_corners(family: str) -> None:
     printer, rng = HardPrinter(family, tags_in(family)), np.random.default_rng(6)
     library, gaps = make_detector("apriltag", family), []
     for _ in range(8):
-        picture = printer.picture(Condition(side_px=60), rng)
+        picture = printer.image(Condition(side_px=60), rng)
         found = {d.id: d for d in library.detect(picture.image, exhaustive=True)}
         gaps.append(found[picture.number].corners - picture.corners)
     assert np.abs(gaps).max() < 0.2

@@ -26,7 +26,7 @@ from model.shapes import (
 )
 from simulation.camera.camera import Optics, SyntheticCamera, sample_rays
 from simulation.camera.rendering import Canvas, draw_triangles, surface_of
-from tests.tracking.tag_pictures import TagPrinter, small_camera
+from tests.tracking.tag_images import TagPrinter, small_camera
 from tracking.camera_model import rays_of
 
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * 0.1
@@ -191,7 +191,7 @@ def test_tags_lie_where_dense_sampling_puts_them() -> None:
     printer = TagPrinter(camera)
     rng = np.random.default_rng(3)
     pose = Pose(np.array([0.02, -0.01, 0.6]), matrix_from_rotation_vector([np.pi, 0.3, 0.2]))
-    picture = printer.picture(pose, rng, noise=0.0)
+    picture = printer.image(pose, rng, noise=0.0)
     dense = _sampled(camera, pose, picture.tag.id, 6)
     inside = np.isfinite(dense)
     gap = picture.image[inside].astype(float) - dense[inside]
@@ -203,7 +203,7 @@ def test_tags_lie_where_dense_sampling_puts_them() -> None:
 def _sampled(camera: Camera, pose: Pose, number: int, samples: int) -> np.ndarray:
     """A tag's image by plain sampling; NaN outside of the black square's inside."""
     from simulation.camera.rendering import INK, PAPER, shade
-    from tests.tracking.tag_pictures import FAMILY, SIZE
+    from tests.tracking.tag_images import FAMILY, SIZE
     from tracking.detection.tags import official_modules
 
     modules = official_modules(FAMILY, number)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.tracking.hard_pictures import Condition, HardPrinter
-from tests.tracking.tag_pictures import FAMILY
+from tests.tracking.hard_images import Condition, HardPrinter
+from tests.tracking.tag_images import FAMILY
 from tracking.camera_model import Region
 from tracking.detection.detector import TagDetector, is_blank
 from tracking.detection.tags import CORNER_SIGNS, TagDecoder, carries_tag, official_modules
@@ -36,7 +36,7 @@ def test_exhaustive_detection_finds_what_standard_detection_misses(
 ) -> None:
     rng, plain, exhaustive = np.random.default_rng(4), 0, 0
     for _ in range(6):
-        picture = printer.picture(HARD[name], rng)
+        picture = printer.image(HARD[name], rng)
         plain += len(detector.detect(picture.image))
         found = detector.detect(picture.image, exhaustive=True)
         assert [d.id for d in found] in ([], [picture.number])
@@ -50,12 +50,12 @@ def test_exhaustive_detection_finds_what_standard_detection_misses(
 def test_a_tag_found_by_both_searches_is_listed_once(
     printer: HardPrinter, detector: TagDetector
 ) -> None:
-    picture = printer.picture(Condition(side_px=60), np.random.default_rng(1))
+    picture = printer.image(Condition(side_px=60), np.random.default_rng(1))
     assert len(detector.detect_all(picture.image, exhaustive=True)) == 1
 
 
 def test_a_region_is_searched_exhaustively_too(printer: HardPrinter, detector: TagDetector) -> None:
-    picture = printer.picture(Condition(side_px=40, contrast=12.0), np.random.default_rng(1))
+    picture = printer.image(Condition(side_px=40, contrast=12.0), np.random.default_rng(1))
     region = Region(40, 20, 280, 220)
     (found,) = detector.detect(picture.image, region, exhaustive=True)
     assert np.abs(found.corners - picture.corners).max() < 3.0
@@ -75,7 +75,7 @@ def test_no_tag_that_can_be_read_is_in_a_blank_picture(
             contrast=np.exp(rng.uniform(np.log(4.0), np.log(200.0))),
             noise=rng.uniform(0.0, 12.0),
         )
-        picture = printer.picture(condition, rng)
+        picture = printer.image(condition, rng)
         if is_blank(picture.image):
             blank += 1
             with monkeypatch.context() as context:

@@ -35,7 +35,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     from calibration.result_files import load_result
     from calibration.targets.boards import read_corners
     from cdpr.console.teach import TaughtPoses
-    from drivers.cameras.files import read_picture
+    from drivers.cameras.files import read_image
     from drivers.cameras.live import VideoFile
     from drivers.can_bus import BusSettings
     from drivers.odrive.endpoints import read_endpoints
@@ -69,7 +69,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "reference": ReferenceFile(bus)._read,
         "latch": lambda path: _at(FaultLatch(bus), path).read(),
         "video": lambda path: sum(1 for _ in VideoFile(path, small)),
-        "picture": read_picture,
+        "picture": read_image,
         "endpoints": lambda path: read_endpoints(path, odrive, layouts),
         "dbc": read_layouts,
         "eds": read_eds.__wrapped__,

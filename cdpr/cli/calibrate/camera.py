@@ -8,8 +8,8 @@ from typing import Any
 
 from calibration.extrinsics.camera_pairs import locate_camera_by_another
 from calibration.extrinsics.surveyed_tags import Survey
+from calibration.images import capture_images
 from calibration.intrinsics.lens import LensChoice
-from calibration.pictures import capture_images
 from calibration.procedures import (
     calibrate_camera,
     calibrate_camera_from_corners,

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.cameras.files import ImageOutput, read_picture
+from drivers.cameras.files import ImageOutput, read_image
 from model.errors import Fault
 from model.files.reading import MOST_PIXELS, is_too_large, stated_size
 
@@ -57,7 +57,7 @@ def test_a_picture_of_900_megapixels_is_not_decoded(
     (tmp_path / "a.png").write_bytes(png(30_000, 30_000))
     monkeypatch.setattr(cv2, "imdecode", decoded)
     assert is_too_large((tmp_path / "a.png").read_bytes())
-    assert read_picture(tmp_path / "a.png") is None
+    assert read_image(tmp_path / "a.png") is None
 
 
 def test_opencv_itself_refuses_it_in_formats_whose_header_is_not_read(tmp_path: Path) -> None:
@@ -65,8 +65,8 @@ def test_opencv_itself_refuses_it_in_formats_whose_header_is_not_read(tmp_path: 
     assert os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] == str(MOST_PIXELS)
     cv2.imwrite(str(tmp_path / "a.pgm"), IMAGE[:, :, 0])
     reads = (
-        "import sys; from pathlib import Path; from drivers.cameras.files import read_picture;"
-        " print(read_picture(Path(sys.argv[1])) is None)"
+        "import sys; from pathlib import Path; from drivers.cameras.files import read_image;"
+        " print(read_image(Path(sys.argv[1])) is None)"
     )
     answers = [
         subprocess.run(
@@ -83,8 +83,8 @@ def test_opencv_itself_refuses_it_in_formats_whose_header_is_not_read(tmp_path: 
 
 def test_a_pipe_or_device_among_pictures_is_none(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.png")
-    assert read_picture(tmp_path / "a.png") is None
-    assert read_picture(Path("/dev/zero")) is None
+    assert read_image(tmp_path / "a.png") is None
+    assert read_image(Path("/dev/zero")) is None
 
 
 def test_a_full_disk_leaves_no_empty_picture(

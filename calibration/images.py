@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 from calibration.targets.boards import Board, DetectedBoard
-from drivers.cameras.files import PICTURE_ENDINGS, ImageFolder, SingleCameraImages
+from drivers.cameras.files import IMAGE_ENDINGS, ImageFolder, SingleCameraImages
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
 from model.cameras import generic_camera
@@ -424,7 +424,7 @@ def _captured(folder: Path) -> list[Path]:
     Raises:
         BadInput: It has others too, which a calibration would mix with new ones.
     """
-    images = [path for path in files_in(folder) if path.suffix.lower() in PICTURE_ENDINGS]
+    images = [path for path in files_in(folder) if path.suffix.lower() in IMAGE_ENDINGS]
     others = [path.name for path in images if not re.fullmatch(r"live_\d{3,}\.png", path.name)]
     if others:
         raise BadInput(

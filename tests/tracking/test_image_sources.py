@@ -13,7 +13,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from calibration.pictures import open_source
+from calibration.images import open_source
 from drivers.cameras.files import ImageFolder, SingleCameraImages, first_gap
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from model.errors import BadInput, HardwareMissing

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import drivers.cameras.live
-from drivers.cameras.live import FROZEN, LOST_PICTURES, LiveCamera
+from drivers.cameras.live import FROZEN, LOST_IMAGES, LiveCamera
 from model.errors import BadInput, Fault, HardwareMissing, StoppedByOperator
 from model.rig import Camera
 
@@ -148,7 +148,7 @@ def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: 
     queue.take(1)
     with LiveCamera("7", camera, queue.clock) as live:
         queue.unplug()
-        with pytest.raises(Fault, match=f"{LOST_PICTURES} times in a row") as caught:
+        with pytest.raises(Fault, match=f"{LOST_IMAGES} times in a row") as caught:
             live.read()
     assert caught.value.where == f"camera {camera.name} (7)"
 

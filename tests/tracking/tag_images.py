@@ -42,7 +42,7 @@ class TagPrinter:
         self.camera = camera
         self._rays = sample_rays(camera)
 
-    def picture(
+    def image(
         self, camera_from_tag: Pose, rng: np.random.Generator, noise: float = 1.0, number: int = 301
     ) -> TagPicture:
         """An image with a tag at a pose."""

@@ -1,6 +1,6 @@
 """Coverage of the 95 % intervals of the platform's pose, by kind of image degradation.
 
-    python benchmarks/measuring/bad_pictures.py [--pictures 200] [--kind jpeg ...] [--seed 1]
+    python benchmarks/measuring/bad_images.py [--pictures 200] [--kind jpeg ...] [--seed 1]
 
 The synthetic camera takes images of the ready rig's cube at random poses, with lamps, shadows, blur
 and in-camera processing. The output for each kind: poses, refusals by their commonest reason, RMS

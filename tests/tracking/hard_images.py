@@ -12,7 +12,7 @@ from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Tag
 from simulation.camera.camera import sample_rays
 from simulation.camera.rendering import Canvas, draw_tag
-from tests.tracking.tag_pictures import SIZE, small_camera
+from tests.tracking.tag_images import SIZE, small_camera
 from tracking.camera_model import pixels_of
 from tracking.detection.tags import tag_corners
 
@@ -41,7 +41,7 @@ class Condition:
 
 
 @dataclass(frozen=True)
-class HardPicture:
+class HardImage:
     """An image of one tag and its true corners, shape (4, 2), [px], lens included."""
 
     image: NDArray[np.uint8]
@@ -62,7 +62,7 @@ class HardPrinter:
         self.family, self.numbers, self.camera = family, numbers, camera or small_camera()
         self._rays = sample_rays(self.camera)
 
-    def picture(self, condition: Condition, rng: np.random.Generator) -> HardPicture:
+    def image(self, condition: Condition, rng: np.random.Generator) -> HardImage:
         """An image with a tag at a random position and rotation."""
         number = int(rng.integers(self.numbers))
         tag = Tag(number, SIZE, Pose.level(np.zeros(3)))
@@ -78,7 +78,7 @@ class HardPrinter:
         pixels = 132.0 + (pixels - 132.0) * np.float32(condition.contrast / 208.0)
         pixels = pixels + condition.noise * rng.standard_normal(pixels.shape)
         image = np.clip(np.round(pixels), 0, 255).astype(np.uint8)
-        return HardPicture(image, number, pixels_of(self.camera, pose.apply(tag_corners(tag))))
+        return HardImage(image, number, pixels_of(self.camera, pose.apply(tag_corners(tag))))
 
     def _pose(self, condition: Condition, rng: np.random.Generator) -> Pose:
         distance = float(self.camera.matrix[0, 0]) * SIZE / condition.side_px
