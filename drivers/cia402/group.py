@@ -36,8 +36,8 @@ from drivers.cia402.state_machine import (
     ControlWord,
     DriveState,
     Goal,
+    SentWords,
     ignoring_drives,
-    next_words,
     stopped_between_replies,
 )
 from drivers.cyclic_group import CyclicBus, CyclicGroup
@@ -101,8 +101,7 @@ class Cia402Group(CyclicGroup):
         self._watch = DriveMonitor(names, self._max_steps, is_warning, missed)
         self._warnings: tuple[DriveWarning, ...] = ()
         self._goal = Goal.IDLE
-        self._words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
-        self._stop_commanded = [False] * count
+        self._sent = SentWords(count)
         self._targets, self._demands = [0] * count, [0] * count
         self._faults = []
         self._cycle = self._cycles_to_goal = 0
@@ -204,15 +203,15 @@ class Cia402Group(CyclicGroup):
         if self._goal is not Goal.RESET_FAULT:  # faults since the last cycle stop this one
             self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
-        words = next_words(self._goal, self._watch.states_to_command, self._stop_commanded)
+        words = self._sent.next_words(self._goal, self._watch.states_to_command)
         if self._is_new_goal and self._goal in (Goal.ENABLE, Goal.RELEASE):
             # No further step until every drive has shown the effect of the last words.
-            words = self._words
+            words = self._sent.words
         self._enables |= ControlWord.ENABLE_OPERATION in words
         self._demands = self._targets if self._known else list(self._watch.positions)
         if following:
             self._targets = [int(target) for target in targets]
-        elif ControlWord.ENABLE_OPERATION not in self._words:
+        elif ControlWord.ENABLE_OPERATION not in self._sent.words:
             # Without power, or held by the drives themselves: the targets follow the positions.
             # Once enabling has begun they are fixed, so that they do not follow a sagging drive.
             self._targets = list(self._watch.positions)
@@ -288,10 +287,7 @@ class Cia402Group(CyclicGroup):
 
     def _send(self, words: tuple[ControlWord, ...], may_send: Callable[[bool], bool]) -> None:
         """Sends one cycle's frames; the words are remembered even if the bus fails."""
-        self._words = words
-        held, stop = DriveState.QUICK_STOP_ACTIVE, ControlWord.QUICK_STOP
-        columns = zip(self._watch.states, words, self._stop_commanded, strict=True)
-        self._stop_commanded = [s is held and (w is stop or was) for s, w, was in columns]
+        self._sent.note(self._watch.states, words)
         self._watch.begin_cycle()
         stops: Sequence[can.Message] = ()
         may_follow = False
@@ -301,8 +297,8 @@ class Cia402Group(CyclicGroup):
         finally:  # a frame that failed must not keep a stop from the other drives
             if not may_follow:  # the drives act on the set-points at SYNC: the last word counts
                 self._stop()
-                self._words = (stop,) * len(words)
-                stops = self._frames.set_points(self._words, self._targets)
+                self._sent.words = (ControlWord.QUICK_STOP,) * len(words)
+                stops = self._frames.set_points(self._sent.words, self._targets)
             self._cyclic.send((*stops, self._frames.sync))
 
     def _check_faults(self) -> None:
@@ -352,17 +348,17 @@ class Cia402Group(CyclicGroup):
             names, words = self._rig.drive_names, self._watch.status_words
             seconds, needs_bit = self._enable_s, self._profile.follows_bit
             idle = ignoring_drives(names, words, seconds) if needs_bit else []
-            follow = set(self._words) == {ControlWord.ENABLE_OPERATION}
+            follow = set(self._sent.words) == {ControlWord.ENABLE_OPERATION}
             if follow and set(states) == {DriveState.OPERATION_ENABLED} and not idle:
                 self._check_modes()
             elif self._cycles_to_goal > self._patience:
-                late = self._watch.late(self._words, self._goal, self._enable_s)
+                late = self._watch.late(self._sent.words, self._goal, self._enable_s)
                 self._latch(late or idle)
         elif self._goal is Goal.RELEASE:
             if all(state in WITHOUT_TORQUE for state in states):
                 self._goal, self._state = Goal.IDLE, GroupState.RELEASED
             elif self._cycles_to_goal > 2 * self._patience:  # it enables the drives first
-                self._latch(self._watch.late(self._words, self._goal, 2.0 * self._enable_s))
+                self._latch(self._watch.late(self._sent.words, self._goal, 2.0 * self._enable_s))
 
     def _check_modes(self) -> None:
         """Enters ENABLED once every drive shows CSP; most profiles check it when configuring."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from enum import Enum, IntEnum, auto
 from itertools import compress
+from types import MappingProxyType
 
 # The CiA 402 state machine as tables: states by status word, and the control words in use.
 #
@@ -273,8 +274,14 @@ _NEXT_WORD = (
 )
 
 
+_NONE_KEPT: Mapping[int, ControlWord] = MappingProxyType({})
+
+
 def next_words(
-    goal: Goal, states: Sequence[DriveState], stop_commanded: Sequence[bool]
+    goal: Goal,
+    states: Sequence[DriveState],
+    stop_commanded: Sequence[bool],
+    kept: Mapping[int, ControlWord] = _NONE_KEPT,
 ) -> tuple[ControlWord, ...]:
     """The control words of the next cycle, one per drive.
 
@@ -283,19 +290,31 @@ def next_words(
         states: As last reported.
         stop_commanded: True for drives that were sent a quick stop since they reported QUICK STOP
             ACTIVE.
+        kept: Words of `SentWords.kept`, by index. None of these drives is enabled, nor are others
+            meanwhile, and a stop is sent to all.
     """
-    if goal is Goal.STOP:
+    is_enabling = goal in (Goal.ENABLE, Goal.RELEASE)
+    if goal is Goal.STOP or (is_enabling and not FAULTED.isdisjoint(states)):
         return (ControlWord.QUICK_STOP,) * len(states)
     if goal is Goal.ENABLE:
-        return _enable(states, stop_commanded)
-    if goal is Goal.RELEASE:
-        return _release(states, stop_commanded)
-    if goal is Goal.RESET_FAULT:
-        return tuple(
-            ControlWord.RESET_FAULT if state is DriveState.FAULT else _idle(state)
+        # The others do not return for a drive that is only passing to its next state.
+        ranked = [_on_the_way(kept[i]) if i in kept else each for i, each in enumerate(states)]
+        words = _enable(ranked, stop_commanded)
+    elif goal is Goal.RELEASE:
+        words = _release(states, stop_commanded)
+    else:
+        resets = goal is Goal.RESET_FAULT
+        words = tuple(
+            ControlWord.RESET_FAULT if resets and state is DriveState.FAULT else _idle(state)
             for state in states
         )
-    return tuple(_idle(state) for state in states)
+    return tuple(kept.get(drive, word) for drive, word in enumerate(words))
+
+
+def _on_the_way(word: ControlWord) -> DriveState:
+    """The state that a drive without torque leaves by a word; never one to be enabled from."""
+    reached = word is ControlWord.SWITCH_ON
+    return DriveState.READY_TO_SWITCH_ON if reached else DriveState.SWITCH_ON_DISABLED
 
 
 def _idle(state: DriveState) -> ControlWord:
@@ -306,8 +325,6 @@ def _enable(
     states: Sequence[DriveState], stop_commanded: Sequence[bool]
 ) -> tuple[ControlWord, ...]:
     """One step towards OPERATION ENABLED; all drives take the last step together."""
-    if any(state in FAULTED for state in states):
-        return (ControlWord.QUICK_STOP,) * len(states)
     lowest = min(_RANKS[state] for state in states)
     # A drive that stopped itself must first be commanded to stop before it is enabled again.
     may_restart = all(
@@ -330,8 +347,6 @@ def _release(
     without it, as one that has no power could not join them: those under torque hold their
     positions, as before, and lose their torque together.
     """
-    if any(state in FAULTED for state in states):
-        return (ControlWord.QUICK_STOP,) * len(states)
     if DriveState.QUICK_STOP_ACTIVE in states:
         holding = [state in _MAY_HOLD for state in states]
         words = iter(_enable([*compress(states, holding)], [*compress(stop_commanded, holding)]))
@@ -342,3 +357,62 @@ def _release(
             for state in states
         )
     return (ControlWord.SHUTDOWN,) * len(states)
+
+
+class SentWords:
+    """Control words sent to the drives, as far as the next ones depend on them.
+
+    Attributes:
+        words: The last ones, one per drive.
+    """
+
+    def __init__(self, count: int) -> None:
+        """Starts with a stop for each drive, of which nothing is known."""
+        self.words: tuple[ControlWord, ...] = (ControlWord.QUICK_STOP,) * count
+        self._stop_commanded = [False] * count
+        self._at_rest = [False] * count
+
+    def note(self, states: Sequence[DriveState], words: tuple[ControlWord, ...]) -> None:
+        """Takes the words that are sent now.
+
+        Args:
+            states: As last reported, in reply to the words before.
+            words: One per drive.
+        """
+        stop, enable = ControlWord.QUICK_STOP, ControlWord.ENABLE_OPERATION
+        stopped = zip(states, words, self._stop_commanded, strict=True)
+        self._stop_commanded = [
+            state is DriveState.QUICK_STOP_ACTIVE and (word is stop or was)
+            for state, word, was in stopped
+        ]
+        resting = zip(states, self.words, words, self._at_rest, strict=True)
+        self._at_rest = [
+            enable not in (before, word) and (state in WITHOUT_TORQUE or (was and state in _SHOWN))
+            for state, before, word, was in resting
+        ]
+        self.words = words
+
+    def kept(self, states: Sequence[DriveState]) -> dict[int, ControlWord]:
+        """Words that drives with an unknown code keep, by index, as they have no torque.
+
+        Each of them showed a state without torque, and was not sent "enable operation" since. Many
+        drives pass through codes outside the standard while they change their state: another word
+        would take them back.
+
+        Args:
+            states: As last reported.
+        """
+        rows = enumerate(zip(states, self.words, self._at_rest, strict=True))
+        return {
+            drive: word
+            for drive, (state, word, at_rest) in rows
+            if at_rest and state is DriveState.NOT_READY
+        }
+
+    def next_words(self, goal: Goal, states: Sequence[DriveState]) -> tuple[ControlWord, ...]:
+        """The control words of the next cycle; see the function of this name."""
+        return next_words(goal, states, self._stop_commanded, self.kept(states))
+
+
+_SHOWN = frozenset({DriveState.NOT_READY, DriveState.SWITCHED_ON})
+"""States that a drive without torque may reach without "enable operation"."""

@@ -1059,6 +1059,55 @@ def test_no_drive_is_enabled_for_a_release_while_the_state_of_one_is_unknown(ben
     assert all(drive.state is HOLDING for drive in bench.drives[:7])
 
 
+def shows_after_ready(drive: SimulatedDrive, code: int, replies: float) -> None:
+    """From its next state *ready to switch on* it shows another code for some replies."""
+    before, left = drive.state, 0.0
+
+    def shown() -> int:
+        nonlocal before, left
+        if before is not DriveState.READY_TO_SWITCH_ON is drive.state:
+            left = replies
+        before = drive.state
+        if left > 0 and drive.state is DriveState.READY_TO_SWITCH_ON:
+            left -= 1
+            return code
+        return drive.status_word
+
+    drive.objects.measured(0x6041, 0, shown)
+
+
+@pytest.mark.parametrize("code", [0x0256, 0x0210])
+@pytest.mark.parametrize("replies", [1, 2, 40])
+def test_a_drive_in_passing_to_ready_is_not_taken_back(
+    bench: Bench, code: int, replies: int
+) -> None:
+    """As 56h of a multi-axis drive: 02h undid each step, also after the code was gone."""
+    bench.group.configure()
+    shows_after_ready(bench.drives[2], code, replies)
+    bench.status = bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.ENABLED, limit=replies + 15)
+    assert bench.status is not None
+    assert bench.status.faults == ()
+
+
+def test_a_drive_that_stays_in_an_unknown_state_is_named_and_none_is_enabled(
+    bench: Bench,
+) -> None:
+    bench.group.configure()
+    shows_after_ready(bench.drives[2], 0x0256, math.inf)
+    bench.status = bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.until(GroupState.FAULT, limit=115)
+    assert bench.status is not None
+    ((node, text),) = bench.status.faults
+    assert node == 3
+    assert "is in not ready to switch on instead of operation enabled after 1 s" in text
+    assert 0x0F not in bench.control_words()
+    bench.cycle()
+    assert set(bench.control_words()) == {0x02}
+
+
 def test_the_heartbeat_comes_from_the_loop(bench: Bench) -> None:
     """With it drives stay enabled; it is counted in cycles, so that a stuck loop sends none."""
     bench.enable()

@@ -12,6 +12,7 @@ from drivers.cia402.state_machine import (
     ControlWord,
     DriveState,
     Goal,
+    SentWords,
     change_on_its_own,
     next_words,
 )
@@ -133,6 +134,133 @@ def test_only_faulted_drives_get_a_reset() -> None:
 def test_unknown_drives_are_stop_commanded() -> None:
     """A drive not heard yet may be holding the platform from an earlier run."""
     assert next_words(Goal.IDLE, [DriveState.NOT_READY], [False]) == (ControlWord.QUICK_STOP,)
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from(Goal), st.lists(STATES, min_size=3, max_size=3)),
+        min_size=1,
+        max_size=12,
+    )
+)
+def test_only_a_drive_that_showed_no_torque_and_was_not_enabled_since_keeps_its_word(
+    cycles: list[tuple[Goal, list[DriveState]]],
+) -> None:
+    """Any states in any order, such as no drive shows: denied unless all replies prove it."""
+    sent = SentWords(3)
+    history: list[tuple[list[DriveState], tuple[ControlWord, ...]]] = []
+    for goal, states in cycles:
+        former = sent.words
+        words = sent.next_words(goal, states)
+        plain = next_words(goal, states, stops_commanded(history, states))
+        unknown = [state is DriveState.NOT_READY for state in states]
+        stops = set(plain) == {ControlWord.QUICK_STOP} and goal is not Goal.ENABLE
+        for drive, word in enumerate(words):
+            if unknown[drive]:
+                assert word is not ControlWord.ENABLE_OPERATION
+                if has_no_torque(history, drive) and not stops and FAULTED.isdisjoint(states):
+                    assert word is former[drive]
+                elif not has_no_torque(history, drive):
+                    assert word is plain[drive]
+        if goal is Goal.STOP or (goal is Goal.ENABLE and not FAULTED.isdisjoint(states)):
+            assert set(words) == {ControlWord.QUICK_STOP}
+        if any(unknown):
+            assert ControlWord.ENABLE_OPERATION not in words
+        else:
+            assert words == plain
+        sent.note(states, words)
+        history.append((states, words))
+
+
+def has_no_torque(
+    history: list[tuple[list[DriveState], tuple[ControlWord, ...]]], drive: int
+) -> bool:
+    """Whether a reply showed it, to another word than 0Fh, and 0Fh has not been sent since."""
+    replied_to = [ControlWord.QUICK_STOP, *(words[drive] for _, words in history)]
+    proven = False
+    for (states, words), before in zip(history, replied_to, strict=False):
+        if ControlWord.ENABLE_OPERATION in (before, words[drive]):
+            proven = False
+        elif states[drive] not in (DriveState.NOT_READY, DriveState.SWITCHED_ON):
+            proven = states[drive] in WITHOUT_TORQUE
+    return proven
+
+
+def stops_commanded(
+    history: list[tuple[list[DriveState], tuple[ControlWord, ...]]], states: list[DriveState]
+) -> list[bool]:
+    """Drives that were sent 02h in an unbroken row of replies with *quick stop active*."""
+    commanded = [False] * len(states)
+    for shown, words in history:
+        commanded = [
+            state is DriveState.QUICK_STOP_ACTIVE and (was or word is ControlWord.QUICK_STOP)
+            for state, word, was in zip(shown, words, commanded, strict=True)
+        ]
+    return commanded
+
+
+@given(
+    drives=st.lists(
+        st.tuples(
+            st.sampled_from(
+                [
+                    DriveState.SWITCH_ON_DISABLED,
+                    DriveState.READY_TO_SWITCH_ON,
+                    DriveState.QUICK_STOP_ACTIVE,
+                ]
+            ),
+            st.integers(0, 4),
+            st.integers(0, 2),
+        ),
+        min_size=1,
+        max_size=6,
+    )
+)
+def test_drives_that_show_unknown_codes_on_the_way_are_enabled_and_released(
+    drives: list[tuple[DriveState, int, int]],
+) -> None:
+    """Each shows them for some replies after each change of its state, and some change it later."""
+    sent = SentWords(len(drives))
+    states = [state for state, _, _ in drives]
+    hidden, waited = [0] * len(drives), [0] * len(drives)
+
+    def step(goal: Goal) -> list[DriveState]:
+        shown = [DriveState.NOT_READY if h else s for h, s in zip(hidden, states, strict=True)]
+        words = sent.next_words(goal, shown)
+        for drive, (word, (_, passing, delay)) in enumerate(zip(words, drives, strict=True)):
+            hidden[drive] = max(0, hidden[drive] - 1)
+            new = after(states[drive], word)
+            waited[drive] = waited[drive] + 1 if new is not states[drive] else 0
+            if waited[drive] > delay:
+                hidden[drive] = passing if new in WITHOUT_TORQUE else 0
+                states[drive], waited[drive] = new, 0
+        sent.note(shown, words)
+        return shown
+
+    def run(goal: Goal, wanted: DriveState) -> None:
+        for _ in range(100):
+            if set(step(goal)) == {wanted}:
+                return
+        pytest.fail(f"not {wanted} but {states}")
+
+    for _ in range(2):  # all have been known once
+        step(Goal.IDLE)
+    run(Goal.ENABLE, DriveState.OPERATION_ENABLED)
+    run(Goal.STOP, DriveState.QUICK_STOP_ACTIVE)
+
+
+@pytest.mark.parametrize("words", [(0x06, "SHUTDOWN SHUTDOWN"), (0x07, "SWITCH_ON SWITCH_ON")])
+def test_the_others_do_not_return_for_a_drive_in_passing(words: tuple[int, str]) -> None:
+    """Two that pass one after the other would never be enabled."""
+    states = [DriveState.SWITCHED_ON, DriveState.NOT_READY]
+    found = next_words(Goal.ENABLE, states, [False] * 2, {1: ControlWord(words[0])})
+    assert " ".join(word.name for word in found) == words[1]
+
+
+def test_while_one_is_unknown_no_drive_is_enabled_for_a_release() -> None:
+    states = [DriveState.QUICK_STOP_ACTIVE, DriveState.NOT_READY]
+    found = next_words(Goal.RELEASE, states, [True] * 2, {1: ControlWord.SHUTDOWN})
+    assert found == (ControlWord.QUICK_STOP, ControlWord.SHUTDOWN)
 
 
 @given(
