@@ -55,8 +55,8 @@ _CSP_LISTED = Expectation(
 _BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
     Expectation(
-        *(0x607E, 0, 0x80, 0, "polarity"),
-        "bit 7 inverts positions but not torques; `direction` of the winch inverts both",
+        *(0x607E, 0, 0xA0, 0, "polarity"),
+        "bit 5 inverts torques alone, bit 7 positions; `direction` of the winch inverts both",
         optional=True,
     ),
     Expectation(

@@ -179,15 +179,16 @@ def test_a_torque_limit_that_is_a_share_of_nothing_is_refused_before_anything_is
     assert not downloads(bus)
 
 
-@pytest.mark.parametrize("polarity", [0x40, 0x80])
-def test_positions_that_are_inverted_without_their_torques_are_refused(
-    rig: Rig, polarity: int
-) -> None:
+@pytest.mark.parametrize("polarity", [0x20, 0x40, 0x80])
+def test_positions_or_torques_that_are_inverted_alone_are_refused(rig: Rig, polarity: int) -> None:
+    """Bit 5 inverts torques, as in a Mitsubishi MR-J5."""
     bus = eight_of("cia402")
     for drive in bus.drives.values():
         drive.objects[0x607E, 0] = drive.objects[0x1016, 0]  # another UNSIGNED8
         drive.values[0x607E, 0] = 0
     bus.drives[2].values[0x607E, 0] = polarity
+    (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("607Eh"))
+    assert row.verdict == ("ok" if polarity == 0x40 else "wrong")
     if polarity == 0x40:  # of velocities, which are not used
         set_up(rig, bus)
         return
