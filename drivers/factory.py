@@ -114,11 +114,13 @@ def unready_remarks(rig: Rig, status_words: Sequence[int]) -> list[str]:
     """
     if rig.document.drives.type == "odrive":
         return []
+    from drivers.cia402.profile import power_bits, profile_of
     from drivers.cia402.state_machine import without_power
 
+    bits = power_bits(profile_of(rig))
     names: dict[str, list[str]] = {}
     for name, word in zip(rig.drive_names.values(), status_words, strict=True):
-        for reason in without_power(word):
+        for reason in without_power(word, bits):
             names.setdefault(reason, []).append(name)
     return [f"{', '.join(found)}: {reason}" for reason, found in names.items()]
 

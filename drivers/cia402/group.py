@@ -14,7 +14,7 @@ from drivers.cia402.configure import configure_drives
 from drivers.cia402.monitor import DriveMonitor
 from drivers.cia402.object_dictionary import peer_timeout_ms
 from drivers.cia402.pdo import CyclicFrames, commanding_ids, foreign_master_message, is_command
-from drivers.cia402.profile import profile_of
+from drivers.cia402.profile import power_bits, profile_of
 from drivers.cia402.sdo_jobs import (
     ASKED_AGAIN_AFTER,
     ERROR_REQUESTS,
@@ -98,7 +98,8 @@ class Cia402Group(CyclicGroup):
         self._frames = CyclicFrames(self._nodes)
         names, is_warning = self._rig.drive_names, self._profile.is_warning
         missed = peer_timeout_ms(self._rig) / 1000.0 / self._cycle_s - 1.0  # a cycle may be late
-        self._watch = DriveMonitor(names, self._max_steps, is_warning, missed)
+        bits = power_bits(self._profile)
+        self._watch = DriveMonitor(names, self._max_steps, is_warning, missed, bits)
         self._warnings: tuple[DriveWarning, ...] = ()
         self._goal = Goal.IDLE
         self._sent = SentWords(count)

@@ -35,7 +35,7 @@ from drivers.cia402.object_dictionary import (
     settings_for,
     stated_absent,
 )
-from drivers.cia402.profile import for_unused_pdos, profile_of
+from drivers.cia402.profile import for_unused_pdos, power_bits, profile_of
 from drivers.cia402.sdo import WRITE_ONLY, SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
@@ -172,7 +172,7 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         reader = _Reader(network, node, rows)
         for expected in expectations(rig, profile, node):
             reader.at_expected(expected)
-        reader.at_state()
+        reader.at_state(power_bits(profile, operational=False))
         for index, form, name, why in _PROCESS_DATA:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
         reader.at_scale(rig.document.winches[drive].counts_per_rev, scales[node], scaled.get(node))
@@ -220,7 +220,7 @@ class _Reader:
         change = "" if good else how_to_set(expected)
         row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
 
-    def at_state(self) -> None:
+    def at_state(self, bits: int) -> None:
         """State of the drive's state machine, with the error of one in fault."""
         row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
         row.meaning = "only drives at rest are configured"
@@ -235,8 +235,8 @@ class _Reader:
             row.note(self._node, text, "wrong", "remove the cause, then run `cdpr reset RIG`")
         elif state is DriveState.OPERATION_ENABLED:
             row.note(self._node, state.value, "remark", "another program moves it; end it first")
-        elif shown := without_power(word):
-            row.note(self._node, state.value, "remark", f"before a motion: {' and '.join(shown)}")
+        elif shown := without_power(word, bits):
+            row.note(self._node, state.value, "remark", f"before a motion: {'; '.join(shown)}")
         else:
             row.note(self._node, state.value)
 
@@ -397,9 +397,8 @@ def read_states(
     partial: bool = False,
 ) -> DriveSnapshot:
     """Status word, position and torque of every drive; see `drivers.factory.read_drives`."""
-    all_nodes = [winch.node_id for winch in rig.winches]
-    timeout = profile_of(rig).sdo_timeout_ms / 1000.0
-    network = SetupNetwork(bus, pump, all_nodes, timeout=timeout)
+    all_nodes, profile = [winch.node_id for winch in rig.winches], profile_of(rig)
+    network = SetupNetwork(bus, pump, all_nodes, timeout=profile.sdo_timeout_ms / 1000.0)
     network.discard_waiting()
     silence: CdprError | None = None
     try:
@@ -433,13 +432,14 @@ def read_states(
         stored_error(network.client(node).read_if_there) if faulted else 0
         for node, faulted in zip(nodes, is_faulted, strict=True)
     ]
+    bits = power_bits(profile, operational=False)
     return DriveSnapshot(
         positions=np.array(positions, dtype=np.int64),
         torques=np.array(torques, dtype=np.int64) * winding_signs(rig)[drives],
         status_words=np.array(words, dtype=np.int64) & 0xFFFF,
         restarted=restarted,
         errors=tuple(
-            emergency_text(code) if code else " and ".join(without_power(word))
+            emergency_text(code) if code else "; ".join(without_power(word, bits))
             for code, word in zip(codes, words, strict=True)
         ),
         silent=tuple(network.silent),

@@ -23,6 +23,7 @@ from drivers.cia402.state_machine import (
     FOLLOWS,
     INTERNAL_LIMIT,
     MAY_FOLLOW,
+    POWER_BITS,
     TORQUE_ON,
     ControlWord,
     DriveState,
@@ -60,6 +61,7 @@ class DriveMonitor:
         max_steps: Sequence[float],
         is_warning: Callable[[int], bool] = _never,
         heartbeat_cycles: float = inf,
+        power_bits: int = POWER_BITS,
     ) -> None:
         """Starts without any reply.
 
@@ -68,6 +70,7 @@ class DriveMonitor:
             max_steps: Largest motion of each drive in a cycle, [counts].
             is_warning: Whether an EMCY code is only a warning while the drive stays enabled.
             heartbeat_cycles: Cycles without a drive's heartbeat after which its peers may stop.
+            power_bits: As ``bits`` of `without_power`.
         """
         count, nodes = len(names), tuple(names)
         self.nodes = nodes
@@ -82,7 +85,7 @@ class DriveMonitor:
         self._wrong_lengths = 0
         self._check = ReplyCheck(names, max_steps)
         self._is_warning = is_warning
-        self._heartbeat_cycles = heartbeat_cycles
+        self._heartbeat_cycles, self._power_bits = heartbeat_cycles, power_bits
         self._cycle, self._heartbeat_at = 0, dict.fromkeys(nodes, 0)  # cycle of the last one
         self._warnings: list[DriveWarning] = []
         self._new_messages: list[tuple[int, str]] = []
@@ -210,7 +213,7 @@ class DriveMonitor:
             what = change_on_its_own(goal, enables, before, state_of(word))
             if what is not None:
                 cause = None if node in self._over else self._emergencies.get(node)
-                reasons = [*([cause] if cause else []), *without_power(word)]
+                reasons = [*([cause] if cause else []), *without_power(word, self._power_bits)]
                 found.append((node, "; ".join([f"{self._names[node]} {what}", *reasons])))
         return found
 
@@ -274,7 +277,7 @@ class DriveMonitor:
             if not self._is_left(row[0][0], state_of(row[1]))
         ]
         names, words, sent = zip(*rows, strict=True)
-        return late_drives(dict(names), words, sent, goal, seconds)
+        return late_drives(dict(names), words, sent, goal, seconds, self._power_bits)
 
     def require_resettable(self, *, braked: bool) -> list[int]:
         """Nodes in fault; they may be reset only if no other drive holds the platform.

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+from drivers.cia402.state_machine import POWER_BITS, REMOTE
 from model.errors import BadInput
 from model.files.documents import load_yaml
 from model.files.drive_profile_file import ProfileDocument, Range
@@ -67,6 +68,18 @@ def profile_of(rig: Rig) -> ProfileDocument:
     """
     drives = rig.document.drives
     return load_profile(drives.profile if isinstance(drives, Cia402Document) else "cia402")
+
+
+def power_bits(profile: ProfileDocument, *, operational: bool = True) -> int:
+    """Bits of 6041h that show why a drive without torque cannot be enabled.
+
+    Args:
+        profile: Of the drive.
+        operational: It is certainly in the NMT state *operational*; many makes clear bit 9
+            (remote) in the others.
+    """
+    bits = POWER_BITS if profile.power_bits else 0
+    return bits if operational else bits & ~REMOTE
 
 
 def rpdo_parameters(number: int) -> int:

@@ -99,10 +99,17 @@ VOLTAGE_ENABLED, REMOTE, INTERNAL_LIMIT = 1 << 4, 1 << 9, 1 << 11
 FOLLOWS = 1 << 12
 """The target position is used. Source: CiA 402-2, cyclic synchronous position mode."""
 
+POWER_BITS = VOLTAGE_ENABLED | REMOTE
+"""Bits that are 0 in drives that cannot be enabled, and in some makes without such a meaning."""
+
 _NO_VOLTAGE = (
-    "its bit 4 (voltage enabled) is 0: mains power is off, or safe torque off (STO) is active"
+    "its bit 4 (voltage enabled) is 0: mains power is off, safe torque off (STO) is active, or the"
+    " drive does not use this bit (power_bits of its profile)"
 )
-_LOCAL = "its bit 9 (remote) is 0: its commissioning tool, panel or enable input has control"
+_LOCAL = (
+    "its bit 9 (remote) is 0: its commissioning tool, panel or enable input has control, or the"
+    " drive does not use this bit (power_bits of its profile)"
+)
 _INTERLOCKED = "check mains power, safe torque off (STO) and the enable input"
 _STAYS_STOPPED = (
     "it does not accept 0Fh there (transition 16), so that only a power cycle ends its quick stop,"
@@ -116,6 +123,7 @@ def late_drives(
     commanded: Sequence[ControlWord],
     goal: Goal,
     seconds: float,
+    bits: int = POWER_BITS,
 ) -> list[tuple[int, str]]:
     """Drives that keep the group from its goal, by node, with the likely reason.
 
@@ -127,15 +135,24 @@ def late_drives(
         commanded: Last control word of each of them.
         goal: ENABLE or RELEASE.
         seconds: Time that they had, [s].
+        bits: As for `without_power`.
     """
     wanted = DriveState.OPERATION_ENABLED if goal is Goal.ENABLE else DriveState.READY_TO_SWITCH_ON
     late = f"instead of {wanted.value} after {seconds:g} s (enable_timeout_ms of its profile)"
+
+    def text(name: str, state: DriveState, word: int, sent: ControlWord) -> str:
+        reasons = _reasons(state, word, sent, bits)
+        return "; ".join([f"{name} is in {state.value} {late}", *reasons])
+
     states = [state_of(word) for word in status_words]
     behind = next((step for step in _STEPS[goal] if step.intersection(states)), frozenset())
     rows = zip(names.items(), states, status_words, commanded, strict=True)
     return [
-        (node, f"{name} is in {state.value} {late}{_reason_for(state, status_word, control_word)}")
-        for (node, name), state, status_word, control_word in rows
+        (
+            node,
+            "; ".join([f"{name} is in {state.value} {late}", *_reasons(state, word, sent, bits)]),
+        )
+        for (node, name), state, word, sent in rows
         if state in behind
     ]
 
@@ -175,21 +192,28 @@ def stopped_between_replies(
     ]
 
 
-def _reason_for(state: DriveState, status_word: int, control_word: ControlWord) -> str:
+def _reasons(
+    state: DriveState, status_word: int, control_word: ControlWord, bits: int
+) -> list[str]:
     """Why a drive stays in its state, as far as its status word shows."""
     if state is DriveState.QUICK_STOP_ACTIVE and control_word is ControlWord.ENABLE_OPERATION:
-        return f"; {_STAYS_STOPPED}"
+        return [_STAYS_STOPPED]
     if state not in WITHOUT_TORQUE:
-        return ""
-    return f"; {' and '.join(without_power(status_word)) or _INTERLOCKED}"
+        return []
+    return [*without_power(status_word, bits), _INTERLOCKED]
 
 
-def without_power(status_word: int) -> list[str]:
-    """Reasons in its status word why a drive at rest cannot be enabled; none for others."""
+def without_power(status_word: int, bits: int) -> list[str]:
+    """Likely reasons why a drive at rest cannot be enabled; none for others.
+
+    Args:
+        status_word: As last reported.
+        bits: Those of `POWER_BITS` that have this meaning.
+    """
     if state_of(status_word) not in WITHOUT_TORQUE:
         return []
-    shown = [_LOCAL] if not status_word & REMOTE else []
-    return shown + ([_NO_VOLTAGE] if not status_word & VOLTAGE_ENABLED else [])
+    reasons = {REMOTE: _LOCAL, VOLTAGE_ENABLED: _NO_VOLTAGE}
+    return [reason for bit, reason in reasons.items() if bit & bits & ~status_word]
 
 
 class Goal(Enum):

@@ -209,6 +209,11 @@ class ProfileDocument(Document):
         " no set-point changes before all drives show it; false: it means something else; left"
         " out: it need not be shown, but a drive that no longer shows it stops all",
     )
+    power_bits: bool = Field(
+        default=True,
+        description="in a drive without torque bit 4 of 6041h shows mains power, and bit 9 that it"
+        " follows the control word; false: they mean something else, and are not read",
+    )
     enable_timeout_ms: Annotated[int, Field(ge=100, le=30_000)] = Field(
         default=1000, description="longest time to enable or release, brake included"
     )

@@ -101,7 +101,7 @@ def test_a_bit_that_is_set_from_the_start_warns_of_nothing(before: int) -> None:
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        (0x0240, "voltage enabled) is 0: mains power is off, or safe torque off (STO) is active"),
+        (0x0240, "voltage enabled) is 0: mains power is off, safe torque off (STO) is active, or"),
         (0x0221, "voltage enabled) is 0"),
         (0x0050, "bit 9 (remote) is 0"),
         (0x0250, "switch on disabled"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -21,7 +22,8 @@ from drivers.cia402.state_machine import (
 )
 from drivers.factory import drive_flags, unready_remarks
 from drivers.odrive.messages import AxisState, status_word
-from model.rig import Rig, load_rig
+from model.files.rig_file import RigDocument
+from model.rig import Rig, load_rig, rig_from_document
 from tests.drivers.odrive_bench import ODRIVE_RIG, odrive_rig
 
 # Bits 6..0 as the standard prints them; x is any.
@@ -107,6 +109,26 @@ def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said:
     assert said in found[1]
     assert (";" in found[1]) == bool(said)
     assert ("bit 9" in found[1]) == (said == "remote")
+
+
+@pytest.mark.parametrize("word", [0x0740, 0x0721, 0x0540])
+def test_bits_that_a_make_uses_otherwise_are_no_reason(word: int) -> None:
+    """A maxon EPOS is enabled from there; it was said to have no mains power."""
+    commanded = (ControlWord.ENABLE_OPERATION,) * 2
+    ((_, text),) = late_drives({4: "a", 5: "b"}, (word, 0x0237), commanded, Goal.ENABLE, 1.0, 0)
+    assert "bit" not in text
+    assert text.endswith("; check mains power, safe torque off (STO) and the enable input")
+
+
+def test_the_bits_of_drives_at_rest_are_read_as_the_profile_says(rig: Rig, tmp_path: Path) -> None:
+    assert len(unready_remarks(rig, (0x0721,) * 8)) == 1
+    path = tmp_path / "own.yaml"
+    path.write_text("name: other\nsources: [its manual]\npower_bits: false\n")
+    document = rig.document.model_dump()
+    document["drives"]["profile"] = str(path)
+    theirs = rig_from_document(RigDocument.model_validate(document))
+    assert unready_remarks(theirs, (0x0721,) * 8) == []
+    assert unready_remarks(theirs, (0x0540,) * 8) == []
 
 
 def test_drives_at_rest_that_cannot_be_enabled_are_named_together(rig: Rig) -> None:
