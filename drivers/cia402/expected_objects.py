@@ -10,19 +10,18 @@ from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_set
 from drivers.cia402.error_codes import emergency_text, stored_error
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
 from drivers.cia402.pdo import NmtCommand
-from drivers.cia402.profile import load_profile, profile_names, profile_of
+from drivers.cia402.profile import (
+    HOW_UNLISTED,
+    HOW_WITHOUT_CSP,
+    SUPPORTED_MODES,
+    profile_of,
+)
 from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, silent
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState
 from drivers.plausibility import WrongScale, wrong_scales
 from model.errors import HardwareMissing, Refused
-from model.files.drive_profile_file import (
-    NEEDED,
-    OBJECTS,
-    ProfileDocument,
-    object_key,
-    object_name,
-)
+from model.files.drive_profile_file import ProfileDocument, object_key, object_name
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -44,13 +43,10 @@ class Expectation:
         return f"{self.index:04X}h:{self.sub:02X} {self.name}"
 
 
-SUPPORTED_MODES = 0x6502
-_UNLISTED = "for a drive that has it unlisted, set csp_unlisted: true in its profile"
-
 _CSP_LISTED = Expectation(
     *(SUPPORTED_MODES, 0, 0x80, 0x80, "supported drive modes"),
     "bit 7 is cyclic synchronous position (CSP); Technosoft iPOS and Pilz PRBT do not have it;"
-    f" {_UNLISTED}",
+    f" {HOW_UNLISTED}",
 )
 _BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),
@@ -128,33 +124,7 @@ def how_to_set(expected: Expectation) -> str:
     return BY_MAKERS_TOOL
 
 
-HOW_WITHOUT_CSP = (
-    "use another drive if it has no cyclic synchronous position (CSP), as Technosoft iPOS and Pilz"
-    f" PRBT; {_UNLISTED}"
-)
 BY_MAKERS_TOOL = "set it with the manufacturer's tool and store it"
-
-_BESIDE = {
-    "1006h:00": ", with monitoring: heartbeat",
-    "1016h:01": "; the SYNC time-out alone then stops the drive",
-    "6072h:00": ", with torque_limit",
-    "60C2h:01": ", where the drive needs no interpolation time",
-    "60C2h:02": ", where the drive needs no interpolation time",
-}
-"""Further entries of a profile in which an object is absent."""
-
-
-def how_without(index: int, sub: int) -> str:
-    """The next step for a required object that is missing."""
-    if index == SUPPORTED_MODES:
-        return HOW_WITHOUT_CSP
-    name = "1016h:01" if index == HEARTBEAT_CONSUMERS else object_name(index, sub)
-    if name not in OBJECTS or name in NEEDED:
-        return "use another drive or firmware: no profile can replace it"
-    own = f"list it as absent in your own drive profile{_BESIDE.get(name, '')}"
-    names = [each for each in profile_names() if name in load_profile(each).absent]
-    known = "".join(f"; for {load_profile(each).name} set drives.profile: {each}" for each in names)
-    return own + known
 
 
 # Checks of the drives before anything is written.

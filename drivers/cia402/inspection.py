@@ -22,7 +22,6 @@ from drivers.cia402.expected_objects import (
     expectations,
     holds_limits,
     how_to_set,
-    how_without,
     position_range,
     position_scales,
     require_answers,
@@ -35,7 +34,7 @@ from drivers.cia402.object_dictionary import (
     settings_for,
     stated_absent,
 )
-from drivers.cia402.profile import for_unused_pdos, power_bits, profile_of
+from drivers.cia402.profile import for_unused_pdos, how_without, power_bits, profile_of
 from drivers.cia402.sdo import WRITE_ONLY, SetupNetwork
 from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
@@ -169,14 +168,14 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
     for drive, node in enumerate(all_nodes):
         if node in silent:
             continue
-        reader = _Reader(network, node, rows)
+        reader = _Reader(network, node, rows, profile)
         for expected in expectations(rig, profile, node):
             reader.at_expected(expected)
-        reader.at_state(power_bits(profile, operational=False))
+        reader.at_state()
         for index, form, name, why in _PROCESS_DATA:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
         reader.at_scale(rig.document.winches[drive].counts_per_rev, scales[node], scaled.get(node))
-        reader.at_heartbeats(profile, rig.cable_count)
+        reader.at_heartbeats(rig.cable_count)
         settings = settings_for(rig, drive, winch_map, None)
         for setting in _last_of_each(settings):
             reader.at_setting(setting, _needed(setting))
@@ -204,9 +203,14 @@ class _Reader:
     """Reads one drive's objects into the rows of all drives."""
 
     def __init__(
-        self, network: SetupNetwork, node: int, rows: dict[tuple[int, int], ObjectRow]
+        self,
+        network: SetupNetwork,
+        node: int,
+        rows: dict[tuple[int, int], ObjectRow],
+        profile: ProfileDocument,
     ) -> None:
         self._client, self._node, self._rows = network.client(node), node, rows
+        self._profile = profile
 
     def at_expected(self, expected: Expectation) -> None:
         """An object that must hold a value and is not written."""
@@ -220,7 +224,7 @@ class _Reader:
         change = "" if good else how_to_set(expected)
         row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
 
-    def at_state(self, bits: int) -> None:
+    def at_state(self) -> None:
         """State of the drive's state machine, with the error of one in fault."""
         row = self._row(0x6041, 0, "6041h:00 statusword", "not enabled, no fault")
         row.meaning = "only drives at rest are configured"
@@ -235,15 +239,15 @@ class _Reader:
             row.note(self._node, text, "wrong", "remove the cause, then run `cdpr reset RIG`")
         elif state is DriveState.OPERATION_ENABLED:
             row.note(self._node, state.value, "remark", "another program moves it; end it first")
-        elif shown := without_power(word, bits):
+        elif shown := without_power(word, power_bits(self._profile, operational=False)):
             row.note(self._node, state.value, "remark", f"before a motion: {'; '.join(shown)}")
         else:
             row.note(self._node, state.value)
 
-    def at_heartbeats(self, profile: ProfileDocument, drives: int) -> None:
+    def at_heartbeats(self, drives: int) -> None:
         """Number of heartbeat producers that the drive can monitor."""
         name, needed = "consumer heartbeat entries", f"1; {drives} to monitor every peer as well"
-        used = profile.watches_heartbeats
+        used = self._profile.watches_heartbeats
         row = self._row(
             HEARTBEAT_CONSUMERS, 0, f"1016h:00 {name}", needed if used else "any, not used"
         )
@@ -259,13 +263,9 @@ class _Reader:
         if not used:
             row.note(self._node, str(count))
         elif count < 1:
-            row.note(
-                self._node,
-                "0",
-                "wrong",
-                "a drive that cannot monitor its master is not safe to run",
-            )
-        elif profile.usable_heartbeats(count) < drives:
+            change = "a drive that cannot monitor its master is not safe to run"
+            row.note(self._node, "0", "wrong", change)
+        elif self._profile.usable_heartbeats(count) < drives:
             row.note(self._node, str(count), "remark", "none required: not every peer is monitored")
         else:
             row.note(self._node, str(count))
@@ -375,7 +375,7 @@ class _Reader:
             good = absent and not instead
             row.note(self._node, text, "ok" if good else "remark", instead or "none required")
         else:
-            row.note(self._node, text, "wrong", how_without(index, sub))
+            row.note(self._node, text, "wrong", how_without(self._profile, index, sub))
         return None
 
 

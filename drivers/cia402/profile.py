@@ -13,7 +13,14 @@ from pathlib import Path
 from drivers.cia402.state_machine import POWER_BITS, REMOTE
 from model.errors import BadInput
 from model.files.documents import load_yaml
-from model.files.drive_profile_file import ProfileDocument, Range
+from model.files.drive_profile_file import (
+    NEEDED,
+    OBJECTS,
+    ProfileDocument,
+    Range,
+    object_key,
+    object_name,
+)
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -197,3 +204,60 @@ def interpolation_time(
         + ("" if exponents is None else f" from {exponents.low} to {exponents.high}"),
         next_step="use a rounder number, such as 10, 8 or 4",
     )
+
+
+# What to do about an object that a drive does not have.
+
+SUPPORTED_MODES = 0x6502
+HOW_UNLISTED = "for a drive that has it unlisted, set csp_unlisted: true in its profile"
+HOW_WITHOUT_CSP = (
+    "use another drive if it has no cyclic synchronous position (CSP), as Technosoft iPOS and Pilz"
+    f" PRBT; {HOW_UNLISTED}"
+)
+
+_BESIDE = {
+    "1006h:00": ", with monitoring: heartbeat",
+    "1016h:01": "; the SYNC time-out alone then stops the drive",
+    "6072h:00": ", with torque_limit",
+    "60C2h:01": ", where the drive needs no interpolation time",
+    "60C2h:02": ", where the drive needs no interpolation time",
+}
+"""Further entries of a profile in which an object is absent."""
+
+
+def how_without(profile: ProfileDocument, index: int, sub: int) -> str:
+    """The next step for a required object that is missing.
+
+    Args:
+        profile: Of the drive.
+        index: Of the object.
+        sub: Of the object.
+    """
+    if index == SUPPORTED_MODES:
+        return HOW_WITHOUT_CSP
+    # A drive without the array lacks its entries.
+    name = "1016h:01" if index == object_key("1016h:01")[0] else object_name(index, sub)
+    if name not in OBJECTS or name in NEEDED:
+        return _how_without_standard(profile, index, sub)
+    own = f"list it as absent in your own drive profile{_BESIDE.get(name, '')}"
+    names = [each for each in profile_names() if name in load_profile(each).absent]
+    known = "".join(f"; for {load_profile(each).name} set drives.profile: {each}" for each in names)
+    return own + known
+
+
+def _how_without_standard(profile: ProfileDocument, index: int, sub: int) -> str:
+    """The next step for an object that no profile can declare absent."""
+    name, limit = object_name(index, sub), profile.torque_limit
+    if index == 0x1018:
+        return f"remove {'vendor_id' if sub == 1 else 'product_code'} from the rig file"
+    if name in {each.object for each in profile.expect}:
+        return "if the drive does not need it, remove it from `expect` in your own drive profile"
+    if limit is not None and name in (limit.object, limit.rated):
+        return "name the drive's own current limit as `torque_limit` in your own drive profile"
+    if 0x1400 <= index < 0x1C00:
+        kind = "tpdo" if index & 0x800 else "rpdo"
+        return (
+            f"give the number of another {kind.upper()}, whose mapping can be written, as `{kind}`"
+            " in your own drive profile"
+        )
+    return "use another drive or firmware: no profile can replace it"

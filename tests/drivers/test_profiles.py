@@ -1064,6 +1064,32 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     assert "no profile" in change["6007h:00"]
 
 
+def test_doctor_names_the_keys_for_process_data_that_cannot_be_mapped(rig: Rig) -> None:
+    """A PDO1 with the fixed mapping of CiA 402; "no profile can replace it" was said of it."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.aborts |= dict.fromkeys([(0x1600, 2), (0x1A00, 2), (0x1A00, 3)], 0x06020000)
+    change = {row.object[:8]: row.change for row in examined(rig, bus).rows}
+    assert "as `rpdo` in your own drive profile" in change["1600h:02"]
+    assert "as `tpdo` in your own drive profile" in change["1A00h:02"]
+    assert "as `tpdo` in your own drive profile" in change["1A00h:03"]
+
+
+def test_doctor_names_what_asks_for_a_missing_object(rig: Rig) -> None:
+    """A profile of a sibling drive, and the identity in the rig file."""
+    document = with_profile(rig, "epos4").document.model_dump()
+    document["drives"] |= {"vendor_id": 1, "product_code": 2}
+    theirs = rig_from_document(RigDocument.model_validate(document))
+    bus = eight_of("epos4")
+    asked = {(0x60A8, 0): "`expect`", (0x3001, 1): "`torque_limit`"}
+    asked |= {(0x1018, 1): "remove vendor_id", (0x1018, 2): "remove product_code"}
+    for drive in bus.drives.values():
+        drive.aborts |= dict.fromkeys(asked, 0x06020000)
+    change = {row.object[:8]: row.change for row in examined(theirs, bus).rows}
+    for (index, sub), said in asked.items():
+        assert said in change[f"{index:04X}h:{sub:02X}"]
+
+
 @pytest.mark.parametrize(
     ("key", "kept", "said"),
     [
