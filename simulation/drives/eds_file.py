@@ -1,4 +1,4 @@
-"""EDS files: a drive's objects with access, ranges and defaults.
+"""EDS files: a drive's objects with access, ranges and defaults; a DCF's values are the defaults.
 
 Source: CiA 306. Common deviations of manufacturers' files are accepted: hexadecimal limits of
 signed types, `$NODEID` anywhere in a sum, suffixes of C, a decimal comma, limits that are none, an
@@ -158,7 +158,7 @@ def read_eds(path: Path) -> Eds:
             where = f"{path}: [{name}]"
             index, sub = int(matched[1], 16), int(matched[2] or "0", 16)
             own = {
-                "defaultvalue": sections.get(f"{name}value", {}),
+                "parametervalue": sections.get(f"{name}value", {}),
                 "parametername": sections.get(f"{name}name", {}),
             }
             objects |= _described(index, sub, section, own, where)
@@ -256,12 +256,13 @@ def _variable(section: Mapping[str, str], where: str) -> ObjectDescription:
     if access not in ("ro", "wo", "rw", "rwr", "rww", "const"):
         raise _unfit(f"the access type {access[:40]!r} does not exist", where)
     length, signed = _SIGNED.get(kind) or _UNSIGNED.get(kind, 0), kind in _SIGNED
-    default, of_node = _default(section.get("defaultvalue", ""), kind, length, where)
+    value = section.get("parametervalue", "") or section.get("defaultvalue", "")
+    default, of_node = _default(value, kind, length, where)
     mappable = bool(_number(section.get("pdomapping", ""), where)[0])
     readable, writable = access != "wo", access not in ("ro", "const")
-    limits = [
+    low, high = (
         _limit(section.get(name, ""), kind, length, where) for name in ("lowlimit", "highlimit")
-    ]
+    )
     return ObjectDescription(
         section.get("parametername", ""),
         length,
@@ -272,7 +273,7 @@ def _variable(section: Mapping[str, str], where: str) -> ObjectDescription:
         mappable and readable and access != "rww",
         default,
         of_node,
-        *limits,
+        *_uncrossed(low, high, signed),
     )
 
 
@@ -284,10 +285,15 @@ def _signed(described: ObjectDescription) -> ObjectDescription:
     low, high = (
         each if each is None else _wrapped(each, described.length, True) for each in limits
     )
-    if low is not None and high is not None and low > high:
-        low = high = None
+    low, high = _uncrossed(low, high, True)
     default = _wrapped(described.default, described.length, True)
     return replace(described, signed=True, default=default, low=low, high=high)
+
+
+def _uncrossed(low: int | None, high: int | None, signed: bool) -> tuple[int | None, int | None]:
+    """Limits; none where those of a signed type, as 0 and FFFFh of 16 bits, exclude every value."""
+    crossed = signed and low is not None and high is not None and low > high
+    return (None, None) if crossed else (low, high)
 
 
 def _default(text: str, kind: int, length: int, where: str) -> tuple[int | bytes, bool]:

@@ -291,6 +291,32 @@ def test_positions_and_torques_are_signed_whatever_the_file_says(tmp_path: Path)
         assert line.abort(0x607D, 1, "<i", -600) == line.abort(0x60C2, 2, "<b", -4) == 0
 
 
+@pytest.mark.parametrize("index", ["6007", "605A", "605C", "605E"])
+def test_limits_that_exclude_every_signed_value_do_not_apply(tmp_path: Path, index: str) -> None:
+    """0 to FFFFh of 16 bits: 0 to -1; each value was refused as if by the drive."""
+    path = tmp_path / "crossed.eds"
+    limits = "LowLimit=0\nHighLimit=0xFFFF\n"
+    path.write_text(PLAIN + f"[{index}]\nDataType=3\nAccessType=rw\n{limits}")
+    described = read_eds(path).objects[int(index, 16), 0]
+    assert described.holds(6)
+    assert described.holds(-1)
+
+
+def test_the_values_of_a_dcf_are_those_after_power_on(tmp_path: Path) -> None:
+    """They were ignored without a word."""
+    path = tmp_path / "drive.dcf"
+    text = PLAIN.replace("DefaultValue=6000", "DefaultValue=6000\nParameterValue=7000")
+    array = "[1016]\nObjectType=8\nDataType=7\nAccessType=rw\nParameterValue=5\nCompactSubObj=2\n"
+    path.write_text(
+        text.replace("AccessType=rww", "ParameterValue=\nAccessType=rww")
+        + array
+        + "[1016Value]\n2=9\n"
+    )
+    drive = DriveObjects(read_eds(path), 9)
+    assert [drive[key] for key in ((0x6085, 0), (0x6040, 0), (0x1400, 1))] == [7000, 15, 0x40000209]
+    assert [drive[0x1016, 1], drive[0x1016, 2]] == [5, 9]
+
+
 def test_sub_objects_of_a_compact_array_have_values_and_names_of_their_own(tmp_path: Path) -> None:
     path = tmp_path / "compact.eds"
     path.write_text(
