@@ -24,6 +24,7 @@ from drivers.cia402.expected_objects import (
     require_idle,
     require_no_wrap,
     require_there,
+    saved_alone,
     wrong_scales_of,
     wrong_value,
 )
@@ -202,6 +203,8 @@ def _write_settings(
         own = list(settings[drive])
         refusals.note(_uncross_limits, network, node, own)
         refused += _write_all(network, node, own, refusals)
+        if not rig.winches[drive].absolute:
+            refused += saved_alone(network.client(node).read_if_there)
         _require_held(network, holding & {node})  # not sooner: a drive may react late
         for remark in refused:
             absent.setdefault(remark, []).append(node)

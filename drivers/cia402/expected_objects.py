@@ -101,6 +101,19 @@ MODE_DISPLAY = Expectation(
 """Required mode after the configuration, or once enabled (`ProfileDocument`)."""
 
 
+SAVED_BY_COMMAND = Expectation(
+    *(0x1010, 1, 0x2, 0, "store parameters"),
+    "settings that were lost show a power cycle, with which incremental encoders lose their zero",
+    optional=True,
+)
+"""Bit 1: the drive saves its settings without a command. Source: CiA 301, 7.5.2.13."""
+
+HOW_SAVED = (
+    "it saves its settings on its own (1010h:01, bit 1), so that no power cycle is noticed: run"
+    " `cdpr home` after each, as its encoder is incremental"
+)
+
+
 def expectations(rig: Rig, profile: ProfileDocument, node: int) -> tuple[Expectation, ...]:
     """Requirements of a drive before anything is written to it."""
     listed = () if profile.csp_unlisted else (_CSP_LISTED,)
@@ -119,6 +132,8 @@ def how_to_set(expected: Expectation) -> str:
     """The next step for a wrong value."""
     if expected.index == SUPPORTED_MODES:
         return HOW_WITHOUT_CSP
+    if expected is SAVED_BY_COMMAND:
+        return HOW_SAVED
     if expected.index in (0x1000, 0x1018):
         return "check the node id, and vendor_id and product_code of the rig file"
     return BY_MAKERS_TOOL
@@ -241,6 +256,21 @@ def _quotient(read: Callable[[int, int, str], bytes | None], index: int) -> floa
         return None
     above, below = (int.from_bytes(each or b"", "little") for each in data)
     return above / below if above and below else None
+
+
+def saved_alone(read: Callable[[int, int, str], bytes | None]) -> list[str]:
+    """A remark if a drive saves its settings on its own; none if it does not state it.
+
+    Args:
+        read: As for `position_range`.
+    """
+    try:
+        data = read(SAVED_BY_COMMAND.index, SAVED_BY_COMMAND.sub, SAVED_BY_COMMAND.name)
+    except Refused as error:
+        if "abort_code" not in error.values:
+            raise
+        return []
+    return [HOW_SAVED] if int.from_bytes(data or b"", "little") & SAVED_BY_COMMAND.mask else []
 
 
 SCALE = "position counts per motor turn"

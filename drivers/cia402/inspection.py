@@ -18,6 +18,7 @@ from drivers.cia402.expected_objects import (
     MODE_DISPLAY,
     NO_WRAP,
     POSITION_RANGE,
+    SAVED_BY_COMMAND,
     Expectation,
     expectations,
     holds_limits,
@@ -175,6 +176,8 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
         for index, form, name, why in _PROCESS_DATA:
             reader.at_setting(Setting(index, 0, form, 0, name, why), "readable")
         reader.at_scale(rig.document.winches[drive].counts_per_rev, scales[node], scaled.get(node))
+        if not rig.winches[drive].absolute:
+            reader.at_expected(SAVED_BY_COMMAND, "remark")
         reader.at_heartbeats(rig.cable_count)
         settings = settings_for(rig, drive, winch_map, None)
         for setting in _last_of_each(settings):
@@ -212,7 +215,7 @@ class _Reader:
         self._client, self._node, self._rows = network.client(node), node, rows
         self._profile = profile
 
-    def at_expected(self, expected: Expectation) -> None:
+    def at_expected(self, expected: Expectation, otherwise: Verdict = "wrong") -> None:
         """An object that must hold a value and is not written."""
         row = self._row(expected.index, expected.sub, str(expected), f"{expected.expected:X}h")
         row.meaning = expected.why
@@ -222,7 +225,7 @@ class _Reader:
         value = int.from_bytes(data, "little")
         good = value & expected.mask == expected.expected
         change = "" if good else how_to_set(expected)
-        row.note(self._node, f"{value:X}h", "ok" if good else "wrong", change)
+        row.note(self._node, f"{value:X}h", "ok" if good else otherwise, change)
 
     def at_state(self) -> None:
         """State of the drive's state machine, with the error of one in fault."""

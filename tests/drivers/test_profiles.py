@@ -197,6 +197,39 @@ def test_positions_or_torques_that_are_inverted_alone_are_refused(rig: Rig, pola
     assert not downloads(bus)
 
 
+@pytest.mark.parametrize("encoder", ["incremental", "absolute"])
+@pytest.mark.parametrize("stored", [None, 1, 2, 3])
+def test_a_drive_that_saves_its_settings_on_its_own_is_remarked_on(
+    rig: Rig, stored: int | None, encoder: str
+) -> None:
+    """It looks set up after a power cycle, in which an incremental encoder lost its zero."""
+    document = rig.document.model_dump()
+    for winch in document["winches"]:
+        winch["encoder"] = encoder
+    theirs, bus = rig_from_document(RigDocument.model_validate(document)), eight_of("cia402")
+    if stored is not None:
+        drive = bus.drives[3]
+        drive.objects[0x1010, 1] = drive.objects[0x1006, 0]  # another UNSIGNED32
+        drive.values[0x1010, 1] = stored
+    saves = stored in (2, 3) and encoder == "incremental"
+    rows = [row for row in examined(theirs, bus).rows if row.object.startswith("1010h:01")]
+    assert [row.verdict for row in rows if row.verdict != "ok"] == ["remark"] * saves
+    remarks = [remark for remark in set_up(theirs, bus) if "1010h" in remark]
+    assert len(remarks) == saves
+    if saves:
+        assert remarks[0].startswith("drive 3: ")
+        assert "`cdpr home`" in remarks[0]
+        assert "`cdpr home`" in rows[0].change
+
+
+def test_a_drive_that_refuses_to_state_how_it_saves_is_set_up(rig: Rig) -> None:
+    document = rig.document.model_dump()
+    document["winches"][1]["encoder"] = "incremental"
+    bus = eight_of("cia402")
+    bus.drives[2].aborts[0x1010, 1] = 0x08000022
+    assert not set_up(rig_from_document(RigDocument.model_validate(document)), bus)
+
+
 OFFSETS = {(0x60B0, 0): -1000, (0x60B1, 0): 20, (0x60B2, 0): 5}
 
 
