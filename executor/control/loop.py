@@ -18,7 +18,7 @@ from drivers.factory import stop_alone, without_torque
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
-from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
+from executor.safety.fault_messages import Alarm, AlarmHistory, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
 from executor.supervision import (
@@ -63,7 +63,7 @@ class Loop:
         self._cycle = self._bus_faults = 0
         self._taken_over, self._held_before = False, set[int]()  # nodes
         self._press = 0  # of jogs: the one whose line is followed
-        self._reported: set[tuple[str, str]] = set()
+        self._history = AlarmHistory()
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = self._requested = self._listener_error = ""
         self.error: CdprError | None = None
@@ -331,14 +331,13 @@ class Loop:
         return "at rest" if self._feed.at_rest else f"slowing down {self.motion_phrase}"
 
     def _report_once(self, alarm: Alarm) -> None:
-        """A condition that persists is reported in its first cycle."""
-        if _identity(alarm) not in self._reported:
-            self._reported.add(_identity(alarm))
-            self._report(alarm.code, alarm.text)
+        """Reports an alarm if it is a new one; see `AlarmHistory`."""
+        if text := self._history.new_text(alarm, self._cycle):
+            self._report(alarm.code, text)
 
     def _react(self, alarm: Alarm) -> None:
         if self._needs_quick_stop(alarm):
-            self._reported.add(_identity(alarm))
+            self._history.new_text(alarm, self._cycle)  # not again while the drives stop
             self._fault(alarm.code, alarm.text)
         elif alarm.reaction is StopReaction.PATH_STOP:
             self._note_cause(f"{alarm.text}; stopped {self.motion_phrase}")
@@ -438,9 +437,3 @@ _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.H
 _HELD = "at rest; the drives hold under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none follows set-points"
-
-
-def _identity(alarm: Alarm) -> tuple[str, str]:
-    """A drive may report several faults, each once; measured values change the text."""
-    has_fixed_text = alarm.code in ("drive_fault", "drive_warning")
-    return alarm.code, alarm.text if has_fixed_text else str(alarm.drive)

@@ -115,7 +115,7 @@ def judge(
     """
     course, rig, scene = context.course, context.rig, context.plan.scene
     final_state, began = course.final_state, cycles.path_began
-    warnings = context.texts_of("drive_warning")
+    warnings = dict.fromkeys(context.texts_of("drive_warning"))
     measured = [
         following(cycles, rig.motion.following_error),
         replies(cycles, course.simulated, bool(context.texts_of("drive_silent"))),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +13,8 @@ import can
 import numpy as np
 import pytest
 
+from drivers.can_bus import SentFrame
+from drivers.cia402.pdo import RPDO1_BASE
 from drivers.cia402.state_machine import DriveState
 from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
@@ -226,18 +228,45 @@ def test_a_fault_is_latched_reported_held_and_recorded(
 def test_a_mere_warning_of_a_drive_ends_no_run(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is reported once, however often it is sent; the drive stays enabled."""
+    """One sent in several cycles in a row is one event, and in the verdict each is stated once."""
     monkeypatch.setattr(ProfileDocument, "is_warning", lambda _profile, code: code == 0x3280)
 
     def warn(stage: Stage) -> None:
-        stage.drives[2]._emergency(0x3280)
+        if stage.cycle in (CRUISING, CRUISING + 1, CRUISING + 2, CRUISING + 30):
+            stage.drives[2]._emergency(0x3280)
 
-    with staged(prepared, tmp_path / "run", at(CRUISING, warn)) as stage:
+    with staged(prepared, tmp_path / "run", warn) as stage:
         outcome = stage.run()
         assert outcome.state is State.FINISHED
         reported = [event.text for event in stage.events() if event.code == "drive_warning"]
-    assert len(reported) == 1
+        checks = concluded(stage, outcome)["checks"]
+    assert len(reported) == 2
     assert "3280h" in reported[0]
+    assert [check["name"] for check in checks].count("drive_warning") == 1
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_each_missed_set_point_is_recorded(prepared: PreparedRun, tmp_path: Path) -> None:
+    """A loose connector must not look like one disturbed frame."""
+    cycles = (120, 160, 200, 240)
+
+    def begin(stage: Stage) -> None:
+        cyclic = stage.group._cyclic  # type: ignore[attr-defined]
+        send = cyclic.send
+
+        def loses_one(frames: Iterable[SentFrame]) -> None:
+            lost = RPDO1_BASE + 2 if stage.cycle in cycles else None
+            send([frame for frame in frames if frame.arbitration_id != lost])
+
+        cyclic.send = loses_one
+
+    with staged(prepared, tmp_path / "run", at(0, begin)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+    assert outcome.state is State.FINISHED
+    missed = [event.time_s for event in events if event.code == "set_point_missed"]
+    assert len(missed) == len(cycles)
+    assert np.diff(missed) == pytest.approx(0.4)
 
 
 def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
