@@ -64,6 +64,7 @@ class Loop:
         self._taken_over, self._held_before = False, set[int]()  # nodes
         self._press = 0  # of jogs: the one whose line is followed
         self._history = AlarmHistory()
+        self._path_stop = f"stopped {self.motion_phrase}"
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = self._requested = self._listener_error = ""
         self.error: CdprError | None = None
@@ -340,8 +341,9 @@ class Loop:
             self._history.new_text(alarm, self._cycle)  # not again while the drives stop
             self._fault(alarm.code, alarm.text)
         elif alarm.reaction is StopReaction.PATH_STOP:
-            self._note_cause(f"{alarm.text}; stopped {self.motion_phrase}")
             self._feed.stop()
+            at_rest = self.machine.state is State.SECURING or self._feed.at_rest
+            self._note_cause(f"{alarm.text}; {'at rest' if at_rest else self._path_stop}")
             self.machine.on(Event.PATH_FAULT)
 
     def _needs_quick_stop(self, alarm: Alarm) -> bool:
@@ -351,11 +353,15 @@ class Loop:
         return alarm.reaction is not StopReaction.NOTE
 
     def _fault(self, code: str, text: str) -> None:
-        """Quick stop for all drives at once, latched."""
+        """Quick stop for all drives at once, latched; the cause keeps a path fault before it."""
+        text = f"{text}; quick stop of all drives, fault latched"
+        if self.machine.state is not State.LATCHED and self.cause not in ("", self._requested):
+            unfinished = f"; {self._path_stop}" if self.machine.state in ON_PATH else ""
+            self.cause = f"{self.cause.removesuffix(unfinished)}; then {text}"
         self.machine.on(Event.FAULT)
         self._sender.latched = True
         self._stop_drives()
-        self._report_cause(code, f"{text}; quick stop of all drives, fault latched")
+        self._report_cause(code, text)
         self._drain()
 
     def _stop_drives(self) -> None:

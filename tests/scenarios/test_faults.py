@@ -20,7 +20,7 @@ from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.state_machine import State
-from executor.supervision import StopReason
+from executor.supervision import OperatorRequests, StopReason
 from executor.trajectory.setpoints import PreparedRun, Trajectory, prepare
 from model.errors import Fault, Refused
 from model.files.drive_profile_file import ProfileDocument
@@ -335,21 +335,52 @@ def test_a_full_disk_stops_the_drives(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_first_of_several_causes_is_the_one_that_is_reported(
+def test_a_fault_during_a_path_stop_is_named_after_the_first_cause(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
+    """The stop along the path was begun, but a quick stop overtook it."""
+
     def both(stage: Stage) -> None:
         if stage.cycle == CRUISING:
             late(stage)
         elif stage.cycle == CRUISING + 5:
-            stage.drives[3].silent = True
+            stage.drives[5].fail(0x2310)
 
     with staged(prepared, tmp_path / "run", both) as stage:
         outcome = stage.run()
         codes = [event.code for event in stage.events()]
     assert outcome.state is State.LATCHED
-    assert "late" in outcome.cause
-    assert codes.index("late") < codes.index("drive_silent")
+    first, _, second = outcome.cause.partition("; then ")
+    assert first == "a cycle began 1.4 cycles late"
+    assert second.startswith("cable 6 (drive 6)")
+    assert second.endswith("; quick stop of all drives, fault latched")
+    assert codes.index("late") < codes.index("drive_fault")
+
+
+@pytest.mark.parametrize("then_fails", [False, True])
+@pytest.mark.usefixtures("no_pictures")
+def test_a_path_fault_at_the_goal_is_not_said_to_stop_the_path(
+    prepared: PreparedRun, tmp_path: Path, then_fails: bool
+) -> None:
+    goal = prepared.checked.table.setpoints[-1].tolist()
+    lost: list[int] = []
+
+    def at_goal(stage: Stage) -> None:
+        if not lost and stage.group.targets.tolist() == goal:
+            lost.append(stage.cycle)
+        elif then_fails and lost == [stage.cycle - 2]:
+            stage.drives[5].fail(0x2310)
+
+    def requests() -> OperatorRequests:
+        return OperatorRequests(lost="the supervisor is silent" if lost else "")
+
+    with staged(prepared, tmp_path / "run", at_goal) as stage:
+        stage.board.read = requests  # type: ignore[method-assign]
+        outcome = stage.run()
+    assert outcome.state is State.LATCHED
+    first, _, second = outcome.cause.partition("; then ")
+    assert first == "the supervisor is silent; at rest"
+    assert second.startswith("cable 6 (drive 6)") is then_fails
 
 
 @pytest.mark.parametrize("lateness", [1.5, 2.0, 3.0, 1371.9])
