@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import stop_alone, without_torque
+from drivers.factory import may_have_released, stop_alone, without_torque
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
@@ -55,7 +55,7 @@ class Loop:
             calls: To the supervisor.
         """
         self.machine = Machine()
-        self._checked, self._master = checked, master
+        self._checked, self._rig, self._master = checked, checked.rig, master
         self._group, self._clock = master.group, master.clock
         self._calls = calls
         self._sender = Cycle(checked, master, slack_counts=self.slack_counts)
@@ -208,8 +208,8 @@ class Loop:
         if self.machine.state is not State.SECURING:
             return
         if left.missing.any() or not left.stopped or (held.holding and not left.holding):
-            self.holding = left.holding
-            self._fault("not_held", changed_states(self._checked.rig, held, left))
+            self._note_end(left)
+            self._fault("not_held", changed_states(self._rig, held, left))
             return
         self.machine.on(Event.HELD)
         self._report("held", self._held if left.holding else _NEVER_ENABLED)
@@ -268,9 +268,15 @@ class Loop:
 
     def _nodes_holding(self, status: CycleStatus) -> set[int]:
         """Nodes that hold by torque; those of ODrives hold by brakes, all or none."""
-        released = without_torque(self._checked.rig, status.status_words.tolist())
-        nodes = {*self._checked.rig.drive_names} if status.holding or released else set[int]()
+        released = without_torque(self._rig, status.status_words.tolist())
+        nodes = {*self._rig.drive_names} if status.holding or released else set[int]()
         return nodes.difference(released)
+
+    def _note_end(self, left: CycleStatus | None) -> None:
+        """Notes whether every cable is still held; None where no drive could be read."""
+        silent = [True] * self._rig.cable_count if left is None else left.missing.tolist()
+        held = self.holding if left is None else self._is_held(left)
+        self.holding = held and self._held_before.isdisjoint(may_have_released(self._rig, silent))
 
     def _index(self) -> float:
         """Progress of the motion, for the record."""
@@ -286,9 +292,8 @@ class Loop:
     def _handle_alarms(self, alarms: tuple[Alarm, ...]) -> None:
         """Reacts to alarms, and to a record that cannot be kept."""
         if self._listener_error:
-            lost = Alarm(StopReaction.PATH_STOP, "recorder", self._listener_error)
-            alarms = (*alarms, lost)
-        alarms = shared_causes(alarms, list(self._checked.rig.drive_names.values()))
+            alarms = (*alarms, Alarm(StopReaction.PATH_STOP, "recorder", self._listener_error))
+        alarms = shared_causes(alarms, list(self._rig.drive_names.values()))
         latched = self.machine.state is State.LATCHED
         worst = None if latched else max(alarms, key=lambda alarm: alarm.reaction, default=None)
         for alarm in alarms:
@@ -385,13 +390,13 @@ class Loop:
         except Exception as error:  # the drives have been commanded to stop; nothing more is needed
             text = f"{in_one_line(error)}; the drives stop on loss of the master"
             self._report("bus_lost", text)
+            self._note_end(None)
             return
         if before is None or (left.holding and left.stopped):
             return
-        self.holding = self._is_held(left)
-        rig = self._checked.rig
-        held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
-        if otherwise := changed_states(rig, before, left, np.flatnonzero(~held).tolist()):
+        self._note_end(left)
+        held = np.array(stop_alone(self._rig, before.status_words.tolist())) & ~before.missing
+        if otherwise := changed_states(self._rig, before, left, np.flatnonzero(~held).tolist()):
             self._report("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:
