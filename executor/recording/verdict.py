@@ -395,7 +395,11 @@ ORDINARY = frozenset(
     }
 )
 #: Codes of events with a page that do not stop a run.
-HARMLESS = frozenset({"reply_lost", "no_real_time"})
+HARMLESS = frozenset(
+    {"reply_lost", "set_point_missed", "drive_warning", "no_real_time", "jog_not_begun"}
+)
+#: Those of cameras: a run that measured nothing does not pass.
+_HARMLESS_OF_CAMERAS = frozenset({"camera_sees_nothing", "pictures_dropped"})
 
 
 def page_of(code: str) -> str:
@@ -412,7 +416,7 @@ def faults_among(codes: Iterable[str]) -> list[str]:
     """Fault codes among event codes, each once, in order; those that stop no run are last."""
     known = fault_codes()
     found = [code for code in dict.fromkeys(codes) if code in known]
-    return sorted(found, key=lambda code: code in HARMLESS)
+    return sorted(found, key=lambda code: (code in HARMLESS, code in _HARMLESS_OF_CAMERAS))
 
 
 def page_text(code: str) -> str:
