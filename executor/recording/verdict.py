@@ -395,9 +395,7 @@ ORDINARY = frozenset(
     }
 )
 #: Codes of events with a page that do not stop a run.
-HARMLESS = frozenset(
-    {"reply_lost", "set_point_missed", "drive_warning", "no_real_time", "jog_not_begun"}
-)
+HARMLESS = {"reply_lost", "set_point_missed", "drive_warning", "no_real_time", "jog_not_begun"}
 #: Those of cameras: a run that measured nothing does not pass.
 _HARMLESS_OF_CAMERAS = frozenset({"camera_sees_nothing", "pictures_dropped"})
 
