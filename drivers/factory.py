@@ -96,6 +96,17 @@ def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     return tuple(winch.node_id for winch, word in rows if state_of(word) not in HOLDS)
 
 
+def may_have_released(rig: Rig, missing: Sequence[bool]) -> tuple[int, ...]:
+    """Nodes of silent drives without a brake: one that lost its power has released its cable.
+
+    Args:
+        rig: The robot.
+        missing: Whether each drive did not answer.
+    """
+    rows = zip(rig.winches, missing, strict=True)
+    return tuple(winch.node_id for winch, silent in rows if silent and not winch.brake)
+
+
 def shows_no_torque(status_word: int) -> bool:
     """Whether a CiA 402 drive is certainly not enabled, nor stopped by a fault."""
     from drivers.cia402.state_machine import WITHOUT_TORQUE, DriveState, state_of

@@ -14,11 +14,11 @@ import numpy as np
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import stop_alone, without_torque
+from drivers.factory import may_have_released, stop_alone, without_torque
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
 from executor.control.sync_master import SyncMaster, changed_states
-from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
+from executor.safety.fault_messages import Alarm, AlarmHistory, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
 from executor.supervision import (
@@ -55,7 +55,7 @@ class Loop:
             calls: To the supervisor.
         """
         self.machine = Machine()
-        self._checked, self._master = checked, master
+        self._checked, self._rig, self._master = checked, checked.rig, master
         self._group, self._clock = master.group, master.clock
         self._calls = calls
         self._sender = Cycle(checked, master, slack_counts=self.slack_counts)
@@ -63,7 +63,8 @@ class Loop:
         self._cycle = self._bus_faults = 0
         self._taken_over, self._held_before = False, set[int]()  # nodes
         self._press = 0  # of jogs: the one whose line is followed
-        self._reported: set[tuple[str, str]] = set()
+        self._history = AlarmHistory()
+        self._path_stop = f"stopped {self.motion_phrase}"
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = self._requested = self._listener_error = ""
         self.error: CdprError | None = None
@@ -207,8 +208,8 @@ class Loop:
         if self.machine.state is not State.SECURING:
             return
         if left.missing.any() or not left.stopped or (held.holding and not left.holding):
-            self.holding = left.holding
-            self._fault("not_held", changed_states(self._checked.rig, held, left))
+            self._note_end(left)
+            self._fault("not_held", changed_states(self._rig, held, left))
             return
         self.machine.on(Event.HELD)
         self._report("held", self._held if left.holding else _NEVER_ENABLED)
@@ -267,9 +268,15 @@ class Loop:
 
     def _nodes_holding(self, status: CycleStatus) -> set[int]:
         """Nodes that hold by torque; those of ODrives hold by brakes, all or none."""
-        released = without_torque(self._checked.rig, status.status_words.tolist())
-        nodes = {*self._checked.rig.drive_names} if status.holding or released else set[int]()
+        released = without_torque(self._rig, status.status_words.tolist())
+        nodes = {*self._rig.drive_names} if status.holding or released else set[int]()
         return nodes.difference(released)
+
+    def _note_end(self, left: CycleStatus | None) -> None:
+        """Notes whether every cable is still held; None where no drive could be read."""
+        silent = [True] * self._rig.cable_count if left is None else left.missing.tolist()
+        held = self.holding if left is None else self._is_held(left)
+        self.holding = held and self._held_before.isdisjoint(may_have_released(self._rig, silent))
 
     def _index(self) -> float:
         """Progress of the motion, for the record."""
@@ -285,9 +292,8 @@ class Loop:
     def _handle_alarms(self, alarms: tuple[Alarm, ...]) -> None:
         """Reacts to alarms, and to a record that cannot be kept."""
         if self._listener_error:
-            lost = Alarm(StopReaction.PATH_STOP, "recorder", self._listener_error)
-            alarms = (*alarms, lost)
-        alarms = shared_causes(alarms, list(self._checked.rig.drive_names.values()))
+            alarms = (*alarms, Alarm(StopReaction.PATH_STOP, "recorder", self._listener_error))
+        alarms = shared_causes(alarms, list(self._rig.drive_names.values()))
         latched = self.machine.state is State.LATCHED
         worst = None if latched else max(alarms, key=lambda alarm: alarm.reaction, default=None)
         for alarm in alarms:
@@ -331,18 +337,18 @@ class Loop:
         return "at rest" if self._feed.at_rest else f"slowing down {self.motion_phrase}"
 
     def _report_once(self, alarm: Alarm) -> None:
-        """A condition that persists is reported in its first cycle."""
-        if _identity(alarm) not in self._reported:
-            self._reported.add(_identity(alarm))
-            self._report(alarm.code, alarm.text)
+        """Reports an alarm if it is a new one; see `AlarmHistory`."""
+        if text := self._history.new_text(alarm, self._cycle):
+            self._report(alarm.code, text)
 
     def _react(self, alarm: Alarm) -> None:
         if self._needs_quick_stop(alarm):
-            self._reported.add(_identity(alarm))
+            self._history.new_text(alarm, self._cycle)  # not again while the drives stop
             self._fault(alarm.code, alarm.text)
         elif alarm.reaction is StopReaction.PATH_STOP:
-            self._note_cause(f"{alarm.text}; stopped {self.motion_phrase}")
             self._feed.stop()
+            at_rest = self.machine.state is State.SECURING or self._feed.at_rest
+            self._note_cause(f"{alarm.text}; {'at rest' if at_rest else self._path_stop}")
             self.machine.on(Event.PATH_FAULT)
 
     def _needs_quick_stop(self, alarm: Alarm) -> bool:
@@ -352,11 +358,15 @@ class Loop:
         return alarm.reaction is not StopReaction.NOTE
 
     def _fault(self, code: str, text: str) -> None:
-        """Quick stop for all drives at once, latched."""
+        """Quick stop for all drives at once, latched; the cause keeps a path fault before it."""
+        text = f"{text}; quick stop of all drives, fault latched"
+        if self.machine.state is not State.LATCHED and self.cause not in ("", self._requested):
+            unfinished = f"; {self._path_stop}" if self.machine.state in ON_PATH else ""
+            self.cause = f"{self.cause.removesuffix(unfinished)}; then {text}"
         self.machine.on(Event.FAULT)
         self._sender.latched = True
         self._stop_drives()
-        self._report_cause(code, f"{text}; quick stop of all drives, fault latched")
+        self._report_cause(code, text)
         self._drain()
 
     def _stop_drives(self) -> None:
@@ -380,13 +390,13 @@ class Loop:
         except Exception as error:  # the drives have been commanded to stop; nothing more is needed
             text = f"{in_one_line(error)}; the drives stop on loss of the master"
             self._report("bus_lost", text)
+            self._note_end(None)
             return
         if before is None or (left.holding and left.stopped):
             return
-        self.holding = self._is_held(left)
-        rig = self._checked.rig
-        held = np.array(stop_alone(rig, before.status_words.tolist())) & ~before.missing
-        if otherwise := changed_states(rig, before, left, np.flatnonzero(~held).tolist()):
+        self._note_end(left)
+        held = np.array(stop_alone(self._rig, before.status_words.tolist())) & ~before.missing
+        if otherwise := changed_states(self._rig, before, left, np.flatnonzero(~held).tolist()):
             self._report("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:
@@ -438,9 +448,3 @@ _STOPPABLE = frozenset({State.ENABLING, State.APPROACHING, State.MOVING, State.H
 _HELD = "at rest; the drives hold under torque"
 _BRAKED = "at rest; the brakes of the winches hold"
 _NEVER_ENABLED = "stopped before all drives were enabled; none follows set-points"
-
-
-def _identity(alarm: Alarm) -> tuple[str, str]:
-    """A drive may report several faults, each once; measured values change the text."""
-    has_fixed_text = alarm.code in ("drive_fault", "drive_warning")
-    return alarm.code, alarm.text if has_fixed_text else str(alarm.drive)

@@ -59,7 +59,7 @@ class WinchLoop(Loop):
         else:
             before = self._feed.index
             pace = self._feed.advance() - before
-            tensions = self._checked.rig.tensions_by(self._status.torques)
+            tensions = self._rig.tensions_by(self._status.torques)
             targets, alarms = self._law.next(pace, tensions.tolist())
             if alarms:
                 self._handle_alarms(alarms)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from drivers.drive_group import CycleStatus
-from drivers.factory import without_torque
+from drivers.factory import may_have_released, without_torque
 from executor.control.cycle import SETTLING
 from executor.control.winch_loop import WinchMover
 from executor.interlock.interlock import MotionInterlock
@@ -164,7 +164,7 @@ def move_winches(
                 found = mover.read_status()
                 require_held(rig, result, found)
             except CdprError as error:
-                ended = _not_held(ended, found, error.what)
+                ended = _not_held(rig, ended, found, error.what)
                 last.report_event("not_held", error.what)
                 raise
             if reference is not None:
@@ -189,10 +189,12 @@ def _result(
     return WinchResult(ended.state, ended.cause, before, counts.mean(axis=0), tensions)
 
 
-def _not_held(ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
+def _not_held(rig: Rig, ended: Ended, found: CycleStatus | None, cause: str) -> Ended:
     """The end of a finished motion after which drives were found faulty."""
-    # Silent drives held when they last answered.
-    holding = ended.holding if found is None else found.holding
+    # All held when they last answered, but without power only a brake holds.
+    silent = [True] * rig.cable_count if found is None else found.missing.tolist()
+    held = ended.holding if found is None else found.holding
+    holding = held and not may_have_released(rig, silent)
     return replace(ended, state=State.LATCHED, cause=cause, holding=holding)
 
 

@@ -105,7 +105,7 @@ class CableLoop(Loop):
         here = np.array([begin], dtype=np.int32)
         checked = CheckedSetpoints(rig, cycle, here, fingerprint(cycle, here))
         super().__init__(checked, master, calls)
-        self._rig, self._limits, self._held_now = rig, limits, held
+        self._limits, self._held_now = limits, held
         self._feed = self._feed_at(0.0)
         self._status: CycleStatus | None = None
         self._law: OneCableLaw | None = None

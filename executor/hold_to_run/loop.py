@@ -123,7 +123,7 @@ class JogLoop(Loop):
         self._press, self._from_rest, self._rows = piece.press, piece.from_rest, piece.rows
         self._peak = piece.peak
         rate = self._rate(share) if piece.from_rest else 0.0
-        motion = self._checked.rig.motion
+        motion = self._rig.motion
         self._feed = Feed(len(self._rows), self._checked.cycle, motion, rate=rate)
         self._sender.allow(self._rows)
 

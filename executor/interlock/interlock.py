@@ -297,7 +297,9 @@ class MotionInterlock:
         if not self._is_kept:
             return
         try:
-            lost = release_reason or f"drives released cables under tension ({cause})"
+            lost = (
+                release_reason or f"cables under tension were released, or may have been ({cause})"
+            )
             self._note_end(lost, holding, positions, released)
         except Refused as error:
             self._settle(State.LATCHED, cause or error.what, record)

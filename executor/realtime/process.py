@@ -159,15 +159,14 @@ class RealTimeProcess:
             message.error if isinstance(message, Failed) else self._died() if over else self._hung()
         )
         self._take_in(self._records)
-        if isinstance(message, Failed):
-            self.report_event(_event_code(error), error.what)
-        else:
-            self.report_event("real_time_lost", error.what)
+        is_lost = not isinstance(message, Failed)
+        self.report_event("real_time_lost" if is_lost else _event_code(error), error.what)
         # The others should hold on their own without SYNC.
         doubt = self._check_drives(self._never_enabled)
         if doubt:
             self.report_event("not_held", doubt)
-        cause = f"{error.what}; {doubt}" if doubt else error.what
+        found = doubt or ("all that had torque hold on their own" if is_lost else "")
+        cause = f"{error.what}; {found}" if found else error.what
         return Ended(State.LATCHED, cause, holding=not doubt, true_pose=None)
 
     def read_status(self) -> CycleStatus:
@@ -217,8 +216,7 @@ class RealTimeProcess:
         self._process.join(END_TIMEOUT)
         how = exit_text(self._process)
         return Fault(
-            f"the real-time process died ({how}); the drives stop and hold on their own"
-            " without set-points",
+            f"the real-time process died ({how}); no set-points reach the drives",
             where="real-time process",
             why="it was killed, or the system ran out of memory",
             next_step="check the platform first, then start again from its pose",
@@ -229,8 +227,7 @@ class RealTimeProcess:
         self._process.kill()  # a suspended process ignores SIGTERM
         self._process.join()
         return Fault(
-            "the real-time process hung and was killed; the drives stop and hold on their own"
-            " without set-points",
+            "the real-time process hung and was killed; no set-points reach the drives",
             where="real-time process",
             why="it was suspended, or is waiting for a device that does not answer",
             next_step="check the platform first, then start again from its pose",

@@ -115,7 +115,7 @@ def judge(
     """
     course, rig, scene = context.course, context.rig, context.plan.scene
     final_state, began = course.final_state, cycles.path_began
-    warnings = context.texts_of("drive_warning")
+    warnings = dict.fromkeys(context.texts_of("drive_warning"))
     measured = [
         following(cycles, rig.motion.following_error),
         replies(cycles, course.simulated, bool(context.texts_of("drive_silent"))),
@@ -395,7 +395,9 @@ ORDINARY = frozenset(
     }
 )
 #: Codes of events with a page that do not stop a run.
-HARMLESS = frozenset({"reply_lost", "no_real_time"})
+HARMLESS = {"reply_lost", "set_point_missed", "drive_warning", "no_real_time", "jog_not_begun"}
+#: Those of cameras: a run that measured nothing does not pass.
+_HARMLESS_OF_CAMERAS = frozenset({"camera_sees_nothing", "pictures_dropped"})
 
 
 def page_of(code: str) -> str:
@@ -412,7 +414,7 @@ def faults_among(codes: Iterable[str]) -> list[str]:
     """Fault codes among event codes, each once, in order; those that stop no run are last."""
     known = fault_codes()
     found = [code for code in dict.fromkeys(codes) if code in known]
-    return sorted(found, key=lambda code: code in HARMLESS)
+    return sorted(found, key=lambda code: (code in HARMLESS, code in _HARMLESS_OF_CAMERAS))
 
 
 def page_text(code: str) -> str:

@@ -1,4 +1,4 @@
-"""Alarms of the running rig: how each is worded and what stop it requires."""
+"""Alarms of the running rig: how each is worded, what stop it requires, and which is new."""
 
 from __future__ import annotations
 
@@ -114,6 +114,40 @@ def late(cycles: float, *, too_late: bool) -> Alarm:
     """A cycle began late; too late if drives may have stopped on their own meanwhile."""
     reaction = StopReaction.QUICK_STOP if too_late else StopReaction.PATH_STOP
     return Alarm(reaction, "late", f"a cycle began {cycles:.1f} cycles late")
+
+
+#: Events of one note, such as the missed set-points of one drive, in a motion: a disturbed bus
+#: would fill the record with more.
+NOTE_EVENTS = 10
+
+
+class AlarmHistory:
+    """Finds which alarms of a motion are new, so that each is one event.
+
+    A condition that persists is new in its first cycle only. A note is new again whenever it
+    returns, up to `NOTE_EVENTS` times; the last text states that no more follow.
+    """
+
+    def __init__(self) -> None:
+        """Starts without alarms."""
+        self._seen: dict[tuple[str, str], tuple[int, int]] = {}  # its last cycle, its events
+
+    def new_text(self, alarm: Alarm, cycle: int) -> str:
+        """Text of the event for an alarm of a cycle; empty if it is not a new one."""
+        last, events = self._seen.get(_identity(alarm), (cycle, 0))
+        returns = alarm.reaction is StopReaction.NOTE and cycle > last + 1
+        is_new = events == 0 or (returns and events < NOTE_EVENTS)
+        events += is_new
+        self._seen[_identity(alarm)] = cycle, events
+        if not is_new:
+            return ""
+        return f"{alarm.text}; no more are recorded" if events == NOTE_EVENTS else alarm.text
+
+
+def _identity(alarm: Alarm) -> tuple[str, str]:
+    """A drive may report several faults, each once; measured values change the text."""
+    has_fixed_text = alarm.code in ("drive_fault", "drive_warning")
+    return alarm.code, alarm.text if has_fixed_text else str(alarm.drive)
 
 
 #: Alarms that several drives raise at once for a common cause.

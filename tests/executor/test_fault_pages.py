@@ -122,6 +122,23 @@ def test_faults_are_named_once_and_what_stopped_no_run_comes_last() -> None:
     assert faults_among(codes) == ["slack", "late", "reply_lost"]
 
 
+def harmless_by_the_index() -> list[str]:
+    text = " ".join((PAGES / "index.md").read_text().split())
+    return re.findall("`([a-z_]+)`", text.partition(" do not stop the motion")[0])
+
+
+def test_the_codes_that_stop_no_run_are_those_of_the_index() -> None:
+    codes = harmless_by_the_index()
+    assert len(codes) == 7
+    for code in codes:
+        assert faults_among([code, "cable_loose"]) == ["cable_loose", code]
+
+
+@pytest.mark.parametrize("code", ["camera_sees_nothing", "pictures_dropped"])
+def test_what_cameras_missed_may_fail_a_run_and_comes_before_what_does_not(code: str) -> None:
+    assert faults_among(["drive_warning", code]) == [code, "drive_warning"]
+
+
 @pytest.mark.parametrize(
     "code",
     [*sorted(ORDINARY), *get_args(StopDocument.model_fields["kind"].annotation), "unheard_of"],

@@ -114,6 +114,32 @@ def test_a_motion_that_did_not_begin_is_recorded_with_its_own_cause(
     assert events[0].text in ended.cause
 
 
+@pytest.mark.parametrize(
+    ("doubt", "cause"),
+    [
+        ("drive 3 is in fault", "no set-points reach the drives; drive 3 is in fault"),
+        ("", "no set-points reach the drives; all that had torque hold on their own"),
+    ],
+)
+def test_drives_are_said_to_hold_only_after_they_were_asked(
+    monkeypatch: pytest.MonkeyPatch, doubt: str, cause: str
+) -> None:
+    monkeypatch.setattr(real_time_process, "serve", dies)
+    board, events = SharedRequests(), list[LoopEvent]()
+    records: Any = SimpleNamespace(take_event=events.append)
+    motion_on_board: Any = (Still(), print, board)
+    try:
+        with real_time_process.real_time_process(
+            *motion_on_board, need_real_time=False, check_drives=lambda _released: doubt
+        ) as process:
+            process.arm(records)
+            ended = process.run()
+    finally:
+        board.close()
+    assert ended.cause.endswith(f"; {cause}")
+    assert " hold" not in events[0].text
+
+
 def falls_silent_behind_its_brakes(_job: Any, link: Connection, _supervisor: int) -> None:
     link.send(Armed("", (0,) * 8, released=(1, 2, 3)))
     link.send(Failed(HardwareMissing(SILENT)))

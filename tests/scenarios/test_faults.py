@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +13,14 @@ import can
 import numpy as np
 import pytest
 
+from drivers.can_bus import SentFrame
+from drivers.cia402.pdo import RPDO1_BASE
 from drivers.cia402.state_machine import DriveState
 from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.state_machine import State
-from executor.supervision import StopReason
+from executor.supervision import OperatorRequests, StopReason
 from executor.trajectory.setpoints import PreparedRun, Trajectory, prepare
 from model.errors import Fault, Refused
 from model.files.drive_profile_file import ProfileDocument
@@ -226,18 +228,45 @@ def test_a_fault_is_latched_reported_held_and_recorded(
 def test_a_mere_warning_of_a_drive_ends_no_run(
     prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is reported once, however often it is sent; the drive stays enabled."""
+    """One sent in several cycles in a row is one event, and in the verdict each is stated once."""
     monkeypatch.setattr(ProfileDocument, "is_warning", lambda _profile, code: code == 0x3280)
 
     def warn(stage: Stage) -> None:
-        stage.drives[2]._emergency(0x3280)
+        if stage.cycle in (CRUISING, CRUISING + 1, CRUISING + 2, CRUISING + 30):
+            stage.drives[2]._emergency(0x3280)
 
-    with staged(prepared, tmp_path / "run", at(CRUISING, warn)) as stage:
+    with staged(prepared, tmp_path / "run", warn) as stage:
         outcome = stage.run()
         assert outcome.state is State.FINISHED
         reported = [event.text for event in stage.events() if event.code == "drive_warning"]
-    assert len(reported) == 1
+        checks = concluded(stage, outcome)["checks"]
+    assert len(reported) == 2
     assert "3280h" in reported[0]
+    assert [check["name"] for check in checks].count("drive_warning") == 1
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_each_missed_set_point_is_recorded(prepared: PreparedRun, tmp_path: Path) -> None:
+    """A loose connector must not look like one disturbed frame."""
+    cycles = (120, 160, 200, 240)
+
+    def begin(stage: Stage) -> None:
+        cyclic = stage.group._cyclic  # type: ignore[attr-defined]
+        send = cyclic.send
+
+        def loses_one(frames: Iterable[SentFrame]) -> None:
+            lost = RPDO1_BASE + 2 if stage.cycle in cycles else None
+            send([frame for frame in frames if frame.arbitration_id != lost])
+
+        cyclic.send = loses_one
+
+    with staged(prepared, tmp_path / "run", at(0, begin)) as stage:
+        outcome = stage.run()
+        events = stage.events()
+    assert outcome.state is State.FINISHED
+    missed = [event.time_s for event in events if event.code == "set_point_missed"]
+    assert len(missed) == len(cycles)
+    assert np.diff(missed) == pytest.approx(0.4)
 
 
 def test_less_clearance_than_the_platform_needs_to_stop_is_refused(
@@ -306,21 +335,52 @@ def test_a_full_disk_stops_the_drives(
 
 
 @pytest.mark.usefixtures("no_pictures")
-def test_the_first_of_several_causes_is_the_one_that_is_reported(
+def test_a_fault_during_a_path_stop_is_named_after_the_first_cause(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
+    """The stop along the path was begun, but a quick stop overtook it."""
+
     def both(stage: Stage) -> None:
         if stage.cycle == CRUISING:
             late(stage)
         elif stage.cycle == CRUISING + 5:
-            stage.drives[3].silent = True
+            stage.drives[5].fail(0x2310)
 
     with staged(prepared, tmp_path / "run", both) as stage:
         outcome = stage.run()
         codes = [event.code for event in stage.events()]
     assert outcome.state is State.LATCHED
-    assert "late" in outcome.cause
-    assert codes.index("late") < codes.index("drive_silent")
+    first, _, second = outcome.cause.partition("; then ")
+    assert first == "a cycle began 1.4 cycles late"
+    assert second.startswith("cable 6 (drive 6)")
+    assert second.endswith("; quick stop of all drives, fault latched")
+    assert codes.index("late") < codes.index("drive_fault")
+
+
+@pytest.mark.parametrize("then_fails", [False, True])
+@pytest.mark.usefixtures("no_pictures")
+def test_a_path_fault_at_the_goal_is_not_said_to_stop_the_path(
+    prepared: PreparedRun, tmp_path: Path, then_fails: bool
+) -> None:
+    goal = prepared.checked.table.setpoints[-1].tolist()
+    lost: list[int] = []
+
+    def at_goal(stage: Stage) -> None:
+        if not lost and stage.group.targets.tolist() == goal:
+            lost.append(stage.cycle)
+        elif then_fails and lost == [stage.cycle - 2]:
+            stage.drives[5].fail(0x2310)
+
+    def requests() -> OperatorRequests:
+        return OperatorRequests(lost="the supervisor is silent" if lost else "")
+
+    with staged(prepared, tmp_path / "run", at_goal) as stage:
+        stage.board.read = requests  # type: ignore[method-assign]
+        outcome = stage.run()
+    assert outcome.state is State.LATCHED
+    first, _, second = outcome.cause.partition("; then ")
+    assert first == "the supervisor is silent; at rest"
+    assert second.startswith("cable 6 (drive 6)") is then_fails
 
 
 @pytest.mark.parametrize("lateness", [1.5, 2.0, 3.0, 1371.9])

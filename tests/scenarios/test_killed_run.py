@@ -158,7 +158,8 @@ def at_rest(killed: RunFolder, tmp_path: Path) -> RunFolder:
         ([STOP, HELD], "STOPPED", "stopped"),
         ([], "FAILED", "not_ended"),
         ([STOP], "FAILED", "not_ended"),
-        ([RunEvent(50.0, "drive_warning", "drive 4: hot"), HELD], "FAILED", "not_ended"),
+        ([RunEvent(50.0, "drive_warning", "drive 4: hot"), HELD], "PASSED", "finished"),
+        ([RunEvent(50.0, "camera_sees_nothing", "front: none"), HELD], "FAILED", "not_ended"),
         ([HELD, RunEvent(99.1, "recorder", "the latch cannot be written")], "FAILED", "not_ended"),
     ],
 )

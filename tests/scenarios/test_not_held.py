@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,14 +11,16 @@ import can
 import pytest
 
 from drivers.can_bus import BusSettings
+from drivers.can_errors import BusGone
 from drivers.cia402.pdo import NmtCommand
 from drivers.cia402.state_machine import DriveState
 from executor.control.path_runs import Outcome
 from executor.interlock.fault_latch import FaultLatch
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
-from executor.trajectory.setpoints import PreparedRun
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Fault, Refused
+from model.rig import rig_from_document
 from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.program import call
 from tests.scenarios.stage import Stage, at, staged
@@ -199,6 +201,87 @@ def test_a_drive_that_died_before_the_stop_is_not_reported_again_at_the_end(
         events = stage.events()
     assert "drive 5" in outcome.cause
     assert "not_held" not in [event.code for event in events]
+
+
+def loses_power(drive: SimulatedDrive) -> None:
+    drive.silent = True
+    drive._power_off(DriveState.SWITCH_ON_DISABLED)
+
+
+def powerless(stage: Stage) -> None:
+    loses_power(stage.drives[FIFTH])
+
+
+def all_powerless(stage: Stage) -> None:
+    for drive in stage.drives:
+        loses_power(drive)
+
+
+def unheard(stage: Stage) -> None:
+    """They stop on their own and hold, but nothing shows it."""
+    for drive in stage.drives:
+        drive.silent = True
+
+
+def adapter_gone(stage: Stage) -> None:
+    """Nothing is read either, not even at the end."""
+
+    def gone(*_: object) -> None:
+        raise BusGone("the interface disappeared", "can0")
+
+    stage.group.send_cycle = gone  # type: ignore[method-assign]
+
+
+def with_brakes(prepared: PreparedRun) -> PreparedRun:
+    document = prepared.rig.document
+    winches = [winch.model_copy(update={"brake": True}) for winch in document.winches]
+    rig = rig_from_document(document.model_copy(update={"winches": winches}))
+    return prepare(prepared.plan, rig)
+
+
+@pytest.mark.parametrize("happens", [powerless, all_powerless, unheard, adapter_gone])
+def test_a_drive_without_a_brake_that_is_silent_to_the_end_counts_as_not_held(
+    prepared: PreparedRun, tmp_path: Path, happens: Callable[[Stage], None]
+) -> None:
+    """Its cable may be off its pulley, which an absolute encoder does not show after power-up."""
+    with staged(prepared, tmp_path / "run", at(CRUISING, happens)) as stage:
+        outcome = stage.run()
+    assert outcome.state is State.LATCHED
+    assert not outcome.holding
+
+
+@pytest.mark.parametrize("happens", [powerless, adapter_gone])
+def test_the_brake_of_a_silent_drive_holds_its_cable(
+    prepared: PreparedRun, tmp_path: Path, happens: Callable[[Stage], None]
+) -> None:
+    with staged(with_brakes(prepared), tmp_path / "run", at(CRUISING, happens)) as stage:
+        outcome = stage.run()
+    assert outcome.state is State.LATCHED
+    assert outcome.holding
+
+
+def test_a_drive_that_is_heard_again_at_the_end_has_held(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    def deaf_for_a_while(stage: Stage) -> None:
+        stage.drives[FIFTH].silent = CRUISING <= stage.cycle < CRUISING + 5
+
+    with staged(prepared, tmp_path / "run", deaf_for_a_while) as stage:
+        outcome = stage.run()
+    assert "drive 5" in outcome.cause
+    assert outcome.holding
+
+
+def test_a_drive_that_is_silent_before_it_was_enabled_has_released_nothing(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    def silent_at_once(stage: Stage) -> None:
+        stage.drives[FIFTH].silent = True
+
+    with staged(prepared, tmp_path / "run", at(0, silent_at_once)) as stage:
+        outcome = stage.run()
+    assert "drive 5" in outcome.cause
+    assert outcome.holding
 
 
 @pytest.mark.parametrize("later", [1, 20, 60, 75])

@@ -3,7 +3,16 @@
 from __future__ import annotations
 
 from executor.recording.summary import summarize
-from executor.safety.fault_messages import Alarm, StopReaction, shared_causes
+from executor.safety.fault_messages import (
+    NOTE_EVENTS,
+    Alarm,
+    AlarmHistory,
+    StopReaction,
+    drive_warning,
+    shared_causes,
+    slack,
+    stuck,
+)
 from executor.safety.monitor import Monitor, Observation, WatchLimits
 from tests.executor import fake_run
 
@@ -44,6 +53,35 @@ def test_other_findings_keep_their_order_and_their_texts() -> None:
     both = shared_causes([slack[0], *silent(1, 2), slack[1], late], NAMES)
     assert [alarm.code for alarm in both] == ["slack", "drive_silent", "slack", "late"]
     assert shared_causes([*slack, late], NAMES) == (*slack, late)
+
+
+def missed(drive: int) -> Alarm:
+    return stuck(drive, NAMES[drive - 1], 1, fault=False)
+
+
+def test_a_condition_that_persists_or_returns_is_reported_once_with_its_first_values() -> None:
+    history = AlarmHistory()
+    texts = [history.new_text(slack(3, 0.1 * cycle, 5.0), cycle) for cycle in (0, 1, 2, 9, 20)]
+    assert texts == [slack(3, 0.0, 5.0).text, "", "", "", ""]
+    assert history.new_text(slack(4, 2.1, 5.0), 20), "another cable"
+
+
+def test_a_note_that_returns_is_new_and_one_that_persists_is_not() -> None:
+    history = AlarmHistory()
+    cycles = [0, 1, 1, 2, 4, 5, 7]
+    new = [bool(history.new_text(missed(2), cycle)) for cycle in cycles]
+    assert new == [True, False, False, False, True, False, True]
+    assert history.new_text(missed(3), 7) == missed(3).text, "another drive"
+
+
+def test_notes_that_keep_returning_do_not_fill_the_record() -> None:
+    history, warning = AlarmHistory(), drive_warning(3, "cable 3 (drive 13) reports 3280h")
+    texts = [history.new_text(warning, 2 * n) for n in range(1, NOTE_EVENTS + 5)]
+    assert texts[: NOTE_EVENTS - 1] == [warning.text] * (NOTE_EVENTS - 1)
+    assert texts[NOTE_EVENTS - 1] == f"{warning.text}; no more are recorded"
+    assert set(texts[NOTE_EVENTS:]) == {""}
+    other = drive_warning(3, "cable 3 (drive 13) reports 4210h")
+    assert history.new_text(other, 2 * NOTE_EVENTS + 10) == other.text, "another warning"
 
 
 def test_a_run_that_was_stopped_for_silent_drives_did_not_lose_few_replies() -> None:
