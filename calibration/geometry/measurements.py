@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import radians
 from pathlib import Path
@@ -17,15 +16,13 @@ from calibration.results import data_hash
 from model.files.csv_table import CsvTable
 from model.pose import (
     Array,
-    Pose,
     matrix_from_quaternion,
     read_only,
     rotation_vector_from_matrix,
     skew,
 )
 from model.rig import Rig
-from model.statics.gravity import PRETENSION_SHARE, STANDARD_GRAVITY, working_tensions
-from model.statics.tension_distribution import TensionInfeasible
+from model.statics.gravity import STANDARD_GRAVITY
 
 SHORTEST_REST = 0.4
 """Minimum time without commanded motion that counts as rest, [s]."""
@@ -410,38 +407,3 @@ def _verticals(table: CsvTable) -> Array:
         what += f" {sizes[k]:.3g} in magnitude; at rest it is {at_rest:.3g}"
         raise table.bad(what, "check the unit in the names of the columns, and leave out motion")
     return np.asarray(accelerations / sizes[:, None])
-
-
-# Tensions of samples without measured ones, and their uncertainty.
-
-
-def tension_sigma(rig: Rig) -> float:
-    """Standard deviation of tensions that were not measured, [N].
-
-    In a rig that differs from its file, cables pull against each other. None was slack, so the
-    lowest allowed tension is taken to be two standard deviations below the pretension.
-    """
-    return PRETENSION_SHARE * (rig.max_tension - rig.min_tension) / 2.0
-
-
-def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
-    """Measured tensions; where missing, the working tensions of the pose, shape (n, m), [N].
-
-    Where the pose is unknown, or infeasible for the rig file's cables, they are those of home:
-    `tension_sigma` covers both.
-
-    Args:
-        rig: As in its file.
-        measured: Stationary samples.
-
-    Raises:
-        TensionInfeasible: The rig cannot hold its platform at home.
-    """
-    known = np.isfinite(measured.tensions)
-    likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
-    rotations = measured.first_rotations(rig)
-    positions = measured.origins(rotations)
-    for k in np.flatnonzero(measured.has_position & ~known.all(axis=1)):
-        with suppress(TensionInfeasible):
-            likely[k] = working_tensions(rig, Pose(positions[k], rotations[k])).tensions
-    return np.where(known, measured.tensions, likely)

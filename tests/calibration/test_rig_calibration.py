@@ -28,10 +28,13 @@ from calibration.geometry.measurements import (
     RigMeasurements,
     at_rest,
     joined,
+)
+from calibration.geometry.model import (
+    CountedLengths,
+    RigModel,
     nominal_tensions,
     tension_sigma,
 )
-from calibration.geometry.model import CountedLengths, RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import (
     estimate_cable_compliances,
