@@ -31,6 +31,7 @@ SETTLING = 0.2
 
 _ARRAYS = ("counts", "tensions", "positions", "rotations", "covariances")
 _SENSORS = ("swivels", "verticals")
+_PER_SAMPLE = (*_ARRAYS, *_SENSORS, "reflectors")
 
 
 def _nothing() -> Array:
@@ -50,8 +51,7 @@ class RigMeasurements:
             tracker of one reflector.
         covariances: Of position and rotation vector about world axes, shape (n, 6, 6).
         unused: Why other samples were left out, by name.
-        reflector: Measured point of samples without rotation, platform frame, shape (3,), [m]; of
-            the others it is the origin.
+        reflectors: Measured point of each sample, platform frame, shape (n, 3) or one for all, [m].
         swivels: Swivel angles of the pulleys about their feed directions, right-handed, 0 with the
             rig file's platform at home, shape (n, m), [rad]; NaN where not measured.
         verticals: Upward unit vectors in the frame of an IMU on the platform, from its
@@ -69,7 +69,7 @@ class RigMeasurements:
     rotations: Array
     covariances: Array
     unused: Mapping[str, str] = field(default_factory=dict)
-    reflector: Array = field(default_factory=lambda: np.zeros(3))
+    reflectors: Array = field(default_factory=lambda: np.zeros(3))
     swivels: Array = field(default_factory=_nothing)
     verticals: Array = field(default_factory=_nothing)
     swivel_deviation: float = radians(0.1)
@@ -77,7 +77,9 @@ class RigMeasurements:
     common_deviations: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Fills sensors that were left out with NaN."""
+        """Fills sensors that were left out with NaN, and repeats one reflector for all."""
+        each = np.broadcast_to(self.reflectors, (len(self), 3))
+        object.__setattr__(self, "reflectors", each)
         for key, shape in (("swivels", self.counts.shape), ("verticals", (len(self), 3))):
             if not getattr(self, key).size:
                 object.__setattr__(self, key, read_only(np.full(shape, np.nan)))
@@ -107,15 +109,18 @@ class RigMeasurements:
             positions: World frame, shape (n, 3), [m].
             rotations: ``world_from_platform``, shape (n, 3, 3).
         """
-        arms = np.where(self.has_rotation[:, None], 0.0, rotations @ self.reflector)
-        return np.asarray(positions + arms)
+        return np.asarray(positions + self._arms(rotations))
+
+    def _arms(self, rotations: Array) -> Array:
+        """From the platform's origin to the measured points, world frame, shape (n, 3), [m]."""
+        return np.asarray((rotations @ self.reflectors[..., None])[..., 0])
 
     def origins(self, rotations: Array) -> Array:
         """Measured positions of the platform's origin with given rotations, shape (n, 3), [m]."""
         return self.positions - self.measured_points(np.zeros_like(self.positions), rotations)
 
     def pose_errors(self, positions: Array, rotations: Array) -> Array:
-        """Given minus measured poses, shape (n, 6), [m, rad]; 0 where not measured.
+        """Twists from measured to given poses, shape (n, 6), [m, rad]; 0 where not measured.
 
         Args:
             positions: World frame, shape (n, 3), [m].
@@ -126,6 +131,7 @@ class RigMeasurements:
         turns = rotations @ np.swapaxes(self.rotations, 1, 2)
         for k in np.flatnonzero(self.has_position & self.has_rotation):
             errors[k, 3:] = rotation_vector_from_matrix(turns[k])
+        errors[:, :3] += np.cross(self._arms(rotations), errors[:, 3:])  # of the origin
         errors[~self.has_position] = 0.0
         return errors
 
@@ -139,13 +145,10 @@ class RigMeasurements:
         whole = self.has_position & self.has_rotation
         information[whole] = np.linalg.inv(self.covariances[whole])
         point = self.has_position & ~self.has_rotation
-        arms = rotations[point] @ self.reflector
-        by_twist = np.zeros((len(arms), 3, 6))
-        by_twist[:, :, :3] = np.eye(3)
-        by_twist[:, :, 3:] = np.cross(arms[:, None], np.eye(3))
-        own = np.linalg.inv(self.covariances[point, :3, :3])
-        information[point] = np.swapaxes(by_twist, 1, 2) @ own @ by_twist
-        return information
+        information[point, :3, :3] = np.linalg.inv(self.covariances[point, :3, :3])
+        by_twist = np.tile(np.eye(6), (len(self), 1, 1))
+        by_twist[:, :3, 3:] = np.cross(self._arms(rotations)[:, None], np.eye(3))
+        return np.asarray(np.swapaxes(by_twist, 1, 2) @ information @ by_twist)
 
     def first_rotations(self, rig: Rig) -> Array:
         """Rotations; that of home where not measured, shape (n, 3, 3)."""
@@ -161,9 +164,7 @@ class RigMeasurements:
 
     def part(self, chosen: NDArray[np.bool_]) -> RigMeasurements:
         """The selected samples."""
-        arrays: dict[str, Any] = {
-            key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS + _SENSORS
-        }
+        arrays: dict[str, Any] = {key: read_only(getattr(self, key)[chosen]) for key in _PER_SAMPLE}
         names = tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes)
         return replace(self, names=names, **arrays)
 
@@ -189,16 +190,18 @@ class RigMeasurements:
         """Twists of the measured poses by one deviation of each common error, shape (n, 6, 9).
 
         Displacements of the world, rotations of the world about the middle of the poses, and
-        rotations of the platform's axes alone, as by tags mounted askew. Where no rotation was
-        measured, only displacements; where no pose was, 0.
+        rotations of the platform's axes alone, as by tags or a target mounted askew, about the
+        measured point. Where no rotation was measured, only displacements; where no pose was, 0.
         """
         length, turn = self.common_deviations
         errors, whole = np.zeros((len(self), 6, 9)), self.has_position & self.has_rotation
         errors[self.has_position, :3, :3] = length * np.eye(3)
         errors[whole, 3:, 3:] = turn * np.hstack([np.eye(3), np.eye(3)])
-        middle = self.positions[whole].mean(axis=0) if whole.any() else np.zeros(3)
+        origins = self.origins(self.rotations)
+        middle = origins[whole].mean(axis=0) if whole.any() else np.zeros(3)
         for k in np.flatnonzero(whole):
-            errors[k, :3, 3:6] = -turn * skew(self.positions[k] - middle)
+            errors[k, :3, 3:6] = -turn * skew(origins[k] - middle)
+            errors[k, :3, 6:] = turn * skew(self.positions[k] - origins[k])
         return errors
 
     def without_poses(self) -> RigMeasurements:
@@ -211,7 +214,7 @@ def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
     """Several sources as one; duplicate samples are listed as unused."""
     arrays: dict[str, Any] = {
         key: read_only(np.concatenate([getattr(part, key) for part in parts]))
-        for key in _ARRAYS + _SENSORS
+        for key in _PER_SAMPLE
     }
     names = tuple(name for part in parts for name in part.names)
     unused = {name: why for part in parts for name, why in part.unused.items()}
@@ -311,14 +314,14 @@ _DEVIATIONS = ("std_x_mm", "std_y_mm", "std_z_mm", "std_rx_deg", "std_ry_deg", "
 _TO_SI = np.array([1e-3, 1e-3, 1e-3, *([float(np.radians(1.0))] * 3)])
 
 
-def read_rig_data(path: Path, cables: int) -> RigMeasurements:
+def read_rig_data(path: Path, cables: int, reflector: Array | None = None) -> RigMeasurements:
     """Reads the samples of a CSV file; poses without a stated deviation are exact.
-
-    Positions without rotations are those of one point, as from trackers with one reflector.
 
     Args:
         path: The file.
         cables: Number of cables of the rig.
+        reflector: Point whose positions it contains, such as the target of a tracker, platform
+            frame, shape (3,), [m]; the origin when left out.
 
     Raises:
         BadInput: It cannot be read, a column is missing, superfluous or not of finite numbers,
@@ -357,6 +360,7 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         covariances=read_only(np.einsum("ni,ij->nij", deviations**2, np.eye(6))),
         swivels=read_only(swivels),
         verticals=read_only(_verticals(table)),
+        reflectors=np.zeros(3) if reflector is None else reflector,
     )
 
 

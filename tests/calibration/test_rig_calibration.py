@@ -286,7 +286,7 @@ def test_missing_tensions_are_those_of_the_platform_not_of_its_reflector(
     )
     reflector = np.array([0.02, -0.03, 0.09])
     points = level.positions + rig.home.rotation @ reflector
-    followed = replace(level, positions=points, reflector=reflector)
+    followed = replace(level, positions=points, reflectors=reflector)
     np.testing.assert_allclose(nominal_tensions(rig, followed), nominal_tensions(rig, level))
 
 
@@ -640,7 +640,7 @@ def test_poses_at_the_edge_of_a_suspended_rig_may_be_a_little_outside(
         tilted.measured,
         positions=positions - [0.0, 0.0, 0.2],
         rotations=np.full_like(tilted.measured.rotations, np.nan),
-        reflector=np.array([0.0, 0.0, -0.2]),
+        reflectors=np.array([0.0, 0.0, -0.2]),
     )
     _require_within(suspended, below)
     for scale in (1e3, 25.4, 10.0, 1.0 / 25.4, 1e-3):
