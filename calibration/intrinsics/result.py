@@ -90,10 +90,13 @@ def uncertainty_figure(result: CameraCalibration, quality: CameraQuality) -> str
     down = (np.arange(rows) + 0.5) / rows * height
     pixels = np.array([(x, y) for y in down for x in across])
     found = pixel_uncertainty(result, pixels)
-    most, cell = float(found.max()), (_WIDTH / columns, height * scale / rows)
+    least, most = float(np.nanmin(found)), float(np.nanmax(found))  # NaN where no ray is
+    cell = (_WIDTH / columns, height * scale / rows)
     focal = float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
     shapes = []
     for k, (value, (x, y)) in enumerate(zip(found, pixels * scale, strict=True)):
+        if np.isnan(value):
+            continue
         shade = 0.05 + 0.7 * float(np.sqrt(value / max(most, 1e-12)))
         shapes.append(
             f'<rect x="{x - cell[0] / 2:.1f}" y="{y - cell[1] / 2:.1f}" width="{cell[0]:.1f}"'
@@ -105,8 +108,8 @@ def uncertainty_figure(result: CameraCalibration, quality: CameraQuality) -> str
             )
     at = quality.distance / focal * 1e3
     label = (
-        f"Uncertainty of pixels over the image, {found.min():.2g} to {most:.2g} px, which are"
-        f" {found.min() * at:.2g} to {most * at:.2g} mm at {quality.distance:.2g} m."
+        f"Uncertainty of pixels over the image, {least:.2g} to {most:.2g} px, which are"
+        f" {least * at:.2g} to {most * at:.2g} mm at {quality.distance:.2g} m."
     )
     return drawing("".join(shapes), (_WIDTH, height * scale), label) + _caption(label)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from calibration.intrinsics.calibrate import calibrate_from_views
-from calibration.targets.boards import DetectedBoard, read_corners
+from calibration.targets.boards import Chessboard, DetectedBoard, read_corners
 from model.errors import BadInput
+from model.pose import matrix_from_rotation_vector
 from tests.calibration.test_lens_models import SIZE, views
 from tests.cli.program import call, one_message
 
@@ -68,6 +70,26 @@ def test_copies_do_not_make_up_for_too_few_pictures(tmp_path: Path) -> None:
     file.write_text(text_of(seen | {f"copy {name}": view for name, view in seen.items()}))
     answer = call("calibrate", "camera", file, "--size-px", *SIZE)
     one_message(answer, 2, "3 images have corners", "copy 0 duplicates 0: nothing moved")
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_lens_that_reaches_only_the_middle_is_refused(tmp_path: Path, seed: int) -> None:
+    """The board stays in the middle of the image, too far away for so many coefficients."""
+    rng, size = np.random.default_rng(seed), (1280, 960)
+    matrix = np.array([[1000.0, 0.0, 650.0], [0.0, 1005.0, 470.0], [0.0, 0.0, 1.0]])
+    distortion = np.array([-0.25, 0.08, 0.0005, -0.0003, 0.0])
+    board, seen = Chessboard(9, 6, 0.025).points(), {}
+    for k in range(14):
+        turn, far = np.radians(35.0) * rng.uniform(-1, 1, 3), 1.5 * rng.uniform(0.8, 1.3)
+        middle = np.array([*(0.5 * far * rng.uniform(-0.1, 0.1) for _ in "xy"), far])
+        shift = middle - matrix_from_rotation_vector(turn) @ board.mean(axis=0)
+        corners = cv2.projectPoints(board, turn, shift, matrix, distortion)[0].reshape(-1, 2)
+        noisy = corners + 0.3 * rng.standard_normal(corners.shape)
+        seen[f"{k}"] = DetectedBoard(board, noisy)
+    file = tmp_path / "corners.csv"
+    file.write_text(text_of(seen))
+    answer = call("calibrate", "camera", file, "--size-px", *size, "--lens", "thin-prism")
+    one_message(answer, 2, "no ray through a part of the image", "--lens five")
 
 
 @pytest.mark.parametrize(
