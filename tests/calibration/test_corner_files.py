@@ -64,6 +64,19 @@ def test_pictures_with_few_corners_and_copies_are_left_out_by_name(tmp_path: Pat
     assert found["unused"] == {"few": "has fewer than 8 corners"} | reasons
 
 
+@pytest.mark.parametrize("kept", [slice(0, 9), slice(0, 54, 9), [0] * 9])
+def test_an_image_with_corners_in_one_line_is_left_out_by_name(
+    tmp_path: Path, kept: slice | list[int]
+) -> None:
+    seen, board = views("five", 4), Chessboard(9, 6, 0.025).points()[kept]
+    row = DetectedBoard(np.resize(board, (9, 3)), np.arange(18.0).reshape(9, 2))
+    file = tmp_path / "corners.csv"
+    file.write_text(text_of(seen | {"row": row}))
+    found, unused = read_corners(file)
+    assert set(found) == set(seen)
+    assert unused == {"row": "has corners in one line only"}
+
+
 def test_copies_do_not_make_up_for_too_few_pictures(tmp_path: Path) -> None:
     seen = views("five", 3)
     file = tmp_path / "corners.csv"
@@ -99,7 +112,7 @@ def test_a_lens_that_reaches_only_the_middle_is_refused(tmp_path: Path, seed: in
         ("picture,x_px,y_px,board_x_mm\na,1,2,3\n", "'board_y_mm' is missing"),
         (f"{HEAD}\na,1,2,3\n", "line 2"),
         (f"{HEAD}\na,1,2,3,nan\n", "line 2"),
-        (f"{HEAD}\na,1,2,3,4\n", "no image has 8 corners"),
+        (f"{HEAD}\na,1,2,3,4\n", "no image has 8 corners that are not in one line"),
     ],
 )
 def test_files_that_hold_no_corners_are_refused(tmp_path: Path, text: str, named: str) -> None:
