@@ -315,9 +315,9 @@ def camera_result(
         name: Of the camera in the rig file.
         on: The date.
     """
-    m = result.matrix
+    m, verdict, unused = result.matrix, quality.verdict, _left_out(result)
     return CameraResult(
-        **common_keys(name, on, result.data_hash, result.intervals, quality.verdict, result.unused),
+        **common_keys(name, on, result.data_hash, result.intervals, verdict, unused),
         width_px=result.size[0],
         height_px=result.size[1],
         fx_px=float(m[0, 0]),
@@ -360,6 +360,13 @@ def with_camera(rig: RigDocument, changed: CameraDocument) -> RigDocument:
     return rig.model_copy(update={"cameras": cameras})
 
 
+def _left_out(result: CameraCalibration) -> dict[str, str]:
+    """Why images, and markers in the images used, are not used, by name."""
+    again = "is detected more than once"
+    twice = {f"{name}, {k}": again for name, seen in result.views.items() for k in seen.twice}
+    return {**result.unused, **twice}
+
+
 # Report.
 
 
@@ -394,7 +401,7 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
             *worst_image(result),
             Section("Tilt of the board", tilt_figure(quality), tilted),
             Section("Images used", _image_table(result), used),
-            Section("Images not used", table_of(result.unused.items())),
+            Section("Images not used", table_of(_left_out(result).items())),
         ],
     )
 
