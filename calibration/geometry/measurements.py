@@ -335,21 +335,22 @@ def read_rig_data(path: Path, cables: int, reflector: Array | None = None) -> Ri
     if "time_s" in table.names:
         _require_increasing(table)
     tensions = np.full((n, cables), np.nan)
-    if _has(table, r"tension_\d+_n"):
+    if _has(table, r"tension_\d+", "n|kn|dan|kgf?|lbf?"):
         tensions = table.of([f"tension_{i}_n" for i in range(1, cables + 1)])
     positions, rotations = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
     deviations = np.zeros((n, 6))
-    if _has(table, "[xyz]_mm"):
+    rotated = _has(table, "q_?[wxyz]")
+    if rotated or _has(table, "[xyz]", "mm|cm|m|um|in|inch|ft"):
         positions = table.of(_POSITION) / 1e3
-        if any(name in table.names for name in _ROTATION):
-            rotations = _rotations(table)
+    if rotated:
+        rotations = _rotations(table)
     if _has(table, "std_.*"):
         stated = _DEVIATIONS if np.isfinite(rotations).all() else _DEVIATIONS[:3]
         deviations[:, : len(stated)] = table.of(stated) * _TO_SI[: len(stated)]
         if (deviations[:, : len(stated)] <= 0.0).any():
             raise table.bad("a standard deviation is not positive", "leave out what is unknown")
     swivels = _nothing()
-    if _has(table, r"swivel_\d+_deg"):
+    if _has(table, r"swivel_\d+", "deg|rad"):
         swivels = np.radians(table.of([f"swivel_{i}_deg" for i in range(1, cables + 1)]))
     return RigMeasurements(
         names=tuple(f"{path}, line {table.line(k)}" for k in range(n)),
@@ -364,8 +365,12 @@ def read_rig_data(path: Path, cables: int, reflector: Array | None = None) -> Ri
     )
 
 
-def _has(table: CsvTable, pattern: str) -> bool:
-    """Whether any column belongs to a group, all of which is then required; in any case."""
+def _has(table: CsvTable, names: str, units: str = "") -> bool:
+    """Whether any column belongs to a group, all of which is then required; in any case.
+
+    In any of the units, or without: a measurement in another unit is not ignored but refused.
+    """
+    pattern = rf"({names})([\W_]*({units})\W*)?"
     return any(re.fullmatch(pattern, name, re.IGNORECASE) for name in table.names)
 
 
@@ -398,10 +403,10 @@ _NOT_AT_REST = 0.05
 
 def _verticals(table: CsvTable) -> Array:
     """Upward directions from accelerometers, shape (n, 3); empty without them."""
-    units = [unit for unit in _AT_REST if f"accel_x_{unit}" in table.names]
-    if not units:
+    if not _has(table, "accel_[xyz]", "m_s2|ms2|mps2|g|mg"):
         return _nothing()
-    unit, at_rest = units[0], _AT_REST[units[0]]
+    unit = next((one for one in _AT_REST if _has(table, f"accel_[xyz]_{one}")), "m_s2")
+    at_rest = _AT_REST[unit]
     accelerations = table.of([f"accel_{axis}_{unit}" for axis in "xyz"])
     sizes = np.linalg.norm(accelerations, axis=1)
     wrong = np.flatnonzero(np.abs(sizes / at_rest - 1.0) > _NOT_AT_REST)
