@@ -122,6 +122,17 @@ def test_files_that_hold_no_corners_are_refused(tmp_path: Path, text: str, named
         read_corners(file)
 
 
+@pytest.mark.parametrize("options", [("--square-mm", 25), ("--pictures", 20)])
+def test_options_that_do_not_apply_to_corners_are_refused(
+    tmp_path: Path, options: tuple[str, int]
+) -> None:
+    """As where the positions are in squares, and their side is given beside them."""
+    file = tmp_path / "corners.csv"
+    file.write_text(text_of(views("five", 4)))
+    answer = call("calibrate", "camera", file, "--size-px", *SIZE, *options)
+    one_message(answer, 2, "takes no board and no --pictures", "in mm")
+
+
 def test_the_images_size_is_needed_and_checked(tmp_path: Path) -> None:
     file = tmp_path / "corners.csv"
     file.write_text(text_of(views("five", 6)))
