@@ -55,7 +55,7 @@ from calibration.results import (
     Destination,
     require_file_name,
 )
-from calibration.run_data import poses_by_image, rig_measurements
+from calibration.run_data import poses_by_image, require_reflector_used, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
 from calibration.tag_map.observations import observe_tags
 from calibration.tag_map.result import (
@@ -360,7 +360,7 @@ def calibrate_rig(
         pose_deviations: Of poses beyond those of their file, [m] and [rad], such as of the
             camera's pose: an error of all samples alike, which their number does not reduce.
         without_poses: Use drive positions only, as without a camera.
-        reflector: Measured point of positions without rotations, platform frame, [m].
+        reflector: Point whose positions the CSV files contain, platform frame, [m].
         swivel_deviation: Of measured swivel angles, [rad].
         imu_deviation: Of the vertical by an IMU about any axis, [rad].
         tilt: Largest rotation of the platform in use, [rad].
@@ -391,15 +391,15 @@ def calibrate_rig(
     require_file_name(name, "`name=`")
     given = [data] if isinstance(data, str | PathLike) else sequence_of("data", data)
     paths = [path_of(one) for one in given]
-    counted, measured = rig_measurements(rig, paths)
+    counted, measured = rig_measurements(rig, paths, measured_point)
     measured = replace(
         measured.with_added_deviation(*of_poses),
-        reflector=measured_point,
         swivel_deviation=swivel_deviation,
         imu_deviation=imu_deviation,
     )
     if without_poses:
         measured = measured.without_poses()
+    require_reflector_used(measured, measured_point)
     to = Destination.of(output)
     to.require_free("rig", name)
     with listener.waiting("fitting"):

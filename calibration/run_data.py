@@ -19,7 +19,7 @@ from calibration.geometry.result import require_same_nominal
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput
 from model.files.reading import is_folder
-from model.pose import Pose, interpolate, matrix_from_quaternion
+from model.pose import Array, Pose, interpolate, matrix_from_quaternion
 from model.rig import Rig
 
 
@@ -65,12 +65,16 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
     return poses
 
 
-def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasurements]:
+def rig_measurements(
+    rig: Rig, data: Sequence[Path], reflector: Array | None = None
+) -> tuple[Rig, RigMeasurements]:
     """The rig with the counts of its drives, and its stationary samples.
 
     Args:
         rig: As in its file.
         data: Run folders, and CSV files (docs/data-formats.md).
+        reflector: Point whose positions the CSV files contain, platform frame, shape (3,), [m];
+            the origin when left out.
 
     Raises:
         BadInput: A file cannot be read, is of another rig, or is named twice.
@@ -78,10 +82,37 @@ def rig_measurements(rig: Rig, data: Sequence[Path]) -> tuple[Rig, RigMeasuremen
     _require_once(data)
     runs = [(str(path), RunFolder.open(path).rig()) for path in data if is_folder(path)]
     counted = require_same_nominal(rig, runs)
+    m = rig.cable_count
     parts = [
-        _at_rest(path) if is_folder(path) else read_rig_data(path, rig.cable_count) for path in data
+        _at_rest(path) if is_folder(path) else read_rig_data(path, m, reflector) for path in data
     ]
     return counted, joined(parts)
+
+
+def require_reflector_used(measured: RigMeasurements, reflector: Array) -> None:
+    """Refuses a measured point that applies to no sample, or to files of two kinds.
+
+    Raises:
+        BadInput: No CSV file with positions is used, or only some contain rotations.
+    """
+    if not reflector.any():
+        return
+    used = measured.has_position & measured.reflectors.any(axis=1)
+    if not used.any():
+        raise BadInput(
+            "--reflector-mm is for positions in CSV files; none are used",
+            where="reflector",
+            next_step="leave it out, or pass a CSV file with x_mm, y_mm, z_mm",
+        )
+    rotated = measured.has_rotation[used]
+    if rotated.any() and not rotated.all():
+        raise BadInput(
+            "--reflector-mm is for one tracker, but only some of the CSV files have rotations",
+            where="reflector",
+            why="poses with and without rotations may be those of different points",
+            next_step="write all positions for the platform's origin and leave it out, or pass"
+            " files of one kind",
+        )
 
 
 def _require_once(data: Sequence[Path]) -> None:

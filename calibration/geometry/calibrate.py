@@ -367,7 +367,7 @@ def _require_within(rig: Rig, measured: RigMeasurements) -> None:
     lower, upper = corners.min(axis=0), corners.max(axis=0)
     known = measured.positions[measured.has_position]
     if len(known) and (np.ptp(known, axis=0) > CLOSE_TOGETHER * (upper - lower)).any():
-        room = rig.reach + float(np.linalg.norm(measured.reflector))
+        room = rig.reach + float(np.linalg.norm(measured.reflectors, axis=1).max())
         lower, upper = lower - room, upper + room
     outside = ((measured.positions < lower) | (measured.positions > upper)).any(axis=1)
     if outside.any():

@@ -213,10 +213,8 @@ class RigFitter:
         if unknown.any():
             found = poses_from_lengths(rig, lengths[unknown], measured.part(unknown))
             positions[unknown], rotations[unknown] = found
-        points = self._posed & unknown
-        arms = rotations[points] @ measured.reflector
-        positions[points] = measured.positions[points] - arms
-        return positions, rotations
+        origins = measured.origins(rotations)
+        return np.where(self._posed[:, None], origins, positions), rotations
 
     def _distances(self, errors: Array, weights: Array) -> Array:
         """Distances from the measured poses, in standard deviations, shape (n,)."""
@@ -316,8 +314,8 @@ def poses_from_lengths(
     vague = np.tile(START_DEVIATION**2 * np.eye(6), (len(lengths), 1, 1))
     data = replace(measured, covariances=vague)
     rotations = np.tile(rig.home.rotation, (len(lengths), 1, 1))
-    points = data.positions - rotations @ data.reflector
-    positions = np.where(data.has_position[:, None], points, rig.home.position)
+    origins = data.origins(rotations)
+    positions = np.where(data.has_position[:, None], origins, rig.home.position)
     found = _nearest_poses(rig, lengths, data, START_TURN, (positions, rotations))
     return _nearest_poses(rig, lengths, data.without_poses(), inf, found) if alone else found
 

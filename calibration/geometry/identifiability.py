@@ -204,6 +204,7 @@ def pose_scales(measured: RigMeasurements, fit: RigFit, observability: Observabi
     numbers, unknowns = _numbers(measured, fit), observability.known.shape[1]
     usual = max(numbers - unknowns, _residual_squares(fit), 1.0) / max(numbers, 1)
     errors = measured.pose_errors(fit.positions, fit.rotations)
+    errors[:, :3] = measured.measured_points(fit.positions, fit.rotations) - measured.positions
     rotated = measured.has_position & measured.has_rotation
     scales = np.ones(2)
     for k, known in enumerate((measured.has_position, rotated)):

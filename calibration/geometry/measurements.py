@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import radians
 from pathlib import Path
@@ -17,15 +16,13 @@ from calibration.results import data_hash
 from model.files.csv_table import CsvTable
 from model.pose import (
     Array,
-    Pose,
     matrix_from_quaternion,
     read_only,
     rotation_vector_from_matrix,
     skew,
 )
 from model.rig import Rig
-from model.statics.gravity import PRETENSION_SHARE, STANDARD_GRAVITY, working_tensions
-from model.statics.tension_distribution import TensionInfeasible
+from model.statics.gravity import STANDARD_GRAVITY
 
 SHORTEST_REST = 0.4
 """Minimum time without commanded motion that counts as rest, [s]."""
@@ -34,6 +31,7 @@ SETTLING = 0.2
 
 _ARRAYS = ("counts", "tensions", "positions", "rotations", "covariances")
 _SENSORS = ("swivels", "verticals")
+_PER_SAMPLE = (*_ARRAYS, *_SENSORS, "reflectors")
 
 
 def _nothing() -> Array:
@@ -53,8 +51,7 @@ class RigMeasurements:
             tracker of one reflector.
         covariances: Of position and rotation vector about world axes, shape (n, 6, 6).
         unused: Why other samples were left out, by name.
-        reflector: Measured point of samples without rotation, platform frame, shape (3,), [m]; of
-            the others it is the origin.
+        reflectors: Measured point of each sample, platform frame, shape (n, 3) or one for all, [m].
         swivels: Swivel angles of the pulleys about their feed directions, right-handed, 0 with the
             rig file's platform at home, shape (n, m), [rad]; NaN where not measured.
         verticals: Upward unit vectors in the frame of an IMU on the platform, from its
@@ -72,7 +69,7 @@ class RigMeasurements:
     rotations: Array
     covariances: Array
     unused: Mapping[str, str] = field(default_factory=dict)
-    reflector: Array = field(default_factory=lambda: np.zeros(3))
+    reflectors: Array = field(default_factory=lambda: np.zeros(3))
     swivels: Array = field(default_factory=_nothing)
     verticals: Array = field(default_factory=_nothing)
     swivel_deviation: float = radians(0.1)
@@ -80,7 +77,9 @@ class RigMeasurements:
     common_deviations: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
-        """Fills sensors that were left out with NaN."""
+        """Fills sensors that were left out with NaN, and repeats one reflector for all."""
+        each = np.broadcast_to(self.reflectors, (len(self), 3))
+        object.__setattr__(self, "reflectors", each)
         for key, shape in (("swivels", self.counts.shape), ("verticals", (len(self), 3))):
             if not getattr(self, key).size:
                 object.__setattr__(self, key, read_only(np.full(shape, np.nan)))
@@ -110,15 +109,18 @@ class RigMeasurements:
             positions: World frame, shape (n, 3), [m].
             rotations: ``world_from_platform``, shape (n, 3, 3).
         """
-        arms = np.where(self.has_rotation[:, None], 0.0, rotations @ self.reflector)
-        return np.asarray(positions + arms)
+        return np.asarray(positions + self._arms(rotations))
+
+    def _arms(self, rotations: Array) -> Array:
+        """From the platform's origin to the measured points, world frame, shape (n, 3), [m]."""
+        return np.asarray((rotations @ self.reflectors[..., None])[..., 0])
 
     def origins(self, rotations: Array) -> Array:
         """Measured positions of the platform's origin with given rotations, shape (n, 3), [m]."""
         return self.positions - self.measured_points(np.zeros_like(self.positions), rotations)
 
     def pose_errors(self, positions: Array, rotations: Array) -> Array:
-        """Given minus measured poses, shape (n, 6), [m, rad]; 0 where not measured.
+        """Twists from measured to given poses, shape (n, 6), [m, rad]; 0 where not measured.
 
         Args:
             positions: World frame, shape (n, 3), [m].
@@ -129,6 +131,7 @@ class RigMeasurements:
         turns = rotations @ np.swapaxes(self.rotations, 1, 2)
         for k in np.flatnonzero(self.has_position & self.has_rotation):
             errors[k, 3:] = rotation_vector_from_matrix(turns[k])
+        errors[:, :3] += np.cross(self._arms(rotations), errors[:, 3:])  # of the origin
         errors[~self.has_position] = 0.0
         return errors
 
@@ -142,13 +145,10 @@ class RigMeasurements:
         whole = self.has_position & self.has_rotation
         information[whole] = np.linalg.inv(self.covariances[whole])
         point = self.has_position & ~self.has_rotation
-        arms = rotations[point] @ self.reflector
-        by_twist = np.zeros((len(arms), 3, 6))
-        by_twist[:, :, :3] = np.eye(3)
-        by_twist[:, :, 3:] = np.cross(arms[:, None], np.eye(3))
-        own = np.linalg.inv(self.covariances[point, :3, :3])
-        information[point] = np.swapaxes(by_twist, 1, 2) @ own @ by_twist
-        return information
+        information[point, :3, :3] = np.linalg.inv(self.covariances[point, :3, :3])
+        by_twist = np.tile(np.eye(6), (len(self), 1, 1))
+        by_twist[:, :3, 3:] = np.cross(self._arms(rotations)[:, None], np.eye(3))
+        return np.asarray(np.swapaxes(by_twist, 1, 2) @ information @ by_twist)
 
     def first_rotations(self, rig: Rig) -> Array:
         """Rotations; that of home where not measured, shape (n, 3, 3)."""
@@ -164,9 +164,7 @@ class RigMeasurements:
 
     def part(self, chosen: NDArray[np.bool_]) -> RigMeasurements:
         """The selected samples."""
-        arrays: dict[str, Any] = {
-            key: read_only(getattr(self, key)[chosen]) for key in _ARRAYS + _SENSORS
-        }
+        arrays: dict[str, Any] = {key: read_only(getattr(self, key)[chosen]) for key in _PER_SAMPLE}
         names = tuple(n for n, yes in zip(self.names, chosen.tolist(), strict=True) if yes)
         return replace(self, names=names, **arrays)
 
@@ -192,16 +190,18 @@ class RigMeasurements:
         """Twists of the measured poses by one deviation of each common error, shape (n, 6, 9).
 
         Displacements of the world, rotations of the world about the middle of the poses, and
-        rotations of the platform's axes alone, as by tags mounted askew. Where no rotation was
-        measured, only displacements; where no pose was, 0.
+        rotations of the platform's axes alone, as by tags or a target mounted askew, about the
+        measured point. Where no rotation was measured, only displacements; where no pose was, 0.
         """
         length, turn = self.common_deviations
         errors, whole = np.zeros((len(self), 6, 9)), self.has_position & self.has_rotation
         errors[self.has_position, :3, :3] = length * np.eye(3)
         errors[whole, 3:, 3:] = turn * np.hstack([np.eye(3), np.eye(3)])
-        middle = self.positions[whole].mean(axis=0) if whole.any() else np.zeros(3)
+        origins = self.origins(self.rotations)
+        middle = origins[whole].mean(axis=0) if whole.any() else np.zeros(3)
         for k in np.flatnonzero(whole):
-            errors[k, :3, 3:6] = -turn * skew(self.positions[k] - middle)
+            errors[k, :3, 3:6] = -turn * skew(origins[k] - middle)
+            errors[k, :3, 6:] = turn * skew(self.positions[k] - origins[k])
         return errors
 
     def without_poses(self) -> RigMeasurements:
@@ -214,7 +214,7 @@ def joined(parts: Sequence[RigMeasurements]) -> RigMeasurements:
     """Several sources as one; duplicate samples are listed as unused."""
     arrays: dict[str, Any] = {
         key: read_only(np.concatenate([getattr(part, key) for part in parts]))
-        for key in _ARRAYS + _SENSORS
+        for key in _PER_SAMPLE
     }
     names = tuple(name for part in parts for name in part.names)
     unused = {name: why for part in parts for name, why in part.unused.items()}
@@ -314,14 +314,14 @@ _DEVIATIONS = ("std_x_mm", "std_y_mm", "std_z_mm", "std_rx_deg", "std_ry_deg", "
 _TO_SI = np.array([1e-3, 1e-3, 1e-3, *([float(np.radians(1.0))] * 3)])
 
 
-def read_rig_data(path: Path, cables: int) -> RigMeasurements:
+def read_rig_data(path: Path, cables: int, reflector: Array | None = None) -> RigMeasurements:
     """Reads the samples of a CSV file; poses without a stated deviation are exact.
-
-    Positions without rotations are those of one point, as from trackers with one reflector.
 
     Args:
         path: The file.
         cables: Number of cables of the rig.
+        reflector: Point whose positions it contains, such as the target of a tracker, platform
+            frame, shape (3,), [m]; the origin when left out.
 
     Raises:
         BadInput: It cannot be read, a column is missing, superfluous or not of finite numbers,
@@ -335,21 +335,22 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
     if "time_s" in table.names:
         _require_increasing(table)
     tensions = np.full((n, cables), np.nan)
-    if _has(table, r"tension_\d+_n"):
+    if _has(table, r"tension_\d+", "n|kn|dan|kgf?|lbf?"):
         tensions = table.of([f"tension_{i}_n" for i in range(1, cables + 1)])
     positions, rotations = np.full((n, 3), np.nan), np.full((n, 3, 3), np.nan)
     deviations = np.zeros((n, 6))
-    if _has(table, "[xyz]_mm"):
+    rotated = _has(table, "q_?[wxyz]")
+    if rotated or _has(table, "[xyz]", "mm|cm|m|um|in|inch|ft"):
         positions = table.of(_POSITION) / 1e3
-        if any(name in table.names for name in _ROTATION):
-            rotations = _rotations(table)
+    if rotated:
+        rotations = _rotations(table)
     if _has(table, "std_.*"):
         stated = _DEVIATIONS if np.isfinite(rotations).all() else _DEVIATIONS[:3]
         deviations[:, : len(stated)] = table.of(stated) * _TO_SI[: len(stated)]
         if (deviations[:, : len(stated)] <= 0.0).any():
             raise table.bad("a standard deviation is not positive", "leave out what is unknown")
     swivels = _nothing()
-    if _has(table, r"swivel_\d+_deg"):
+    if _has(table, r"swivel_\d+", "deg|rad"):
         swivels = np.radians(table.of([f"swivel_{i}_deg" for i in range(1, cables + 1)]))
     return RigMeasurements(
         names=tuple(f"{path}, line {table.line(k)}" for k in range(n)),
@@ -360,11 +361,16 @@ def read_rig_data(path: Path, cables: int) -> RigMeasurements:
         covariances=read_only(np.einsum("ni,ij->nij", deviations**2, np.eye(6))),
         swivels=read_only(swivels),
         verticals=read_only(_verticals(table)),
+        reflectors=np.zeros(3) if reflector is None else reflector,
     )
 
 
-def _has(table: CsvTable, pattern: str) -> bool:
-    """Whether any column belongs to a group, all of which is then required; in any case."""
+def _has(table: CsvTable, names: str, units: str = "") -> bool:
+    """Whether any column belongs to a group, all of which is then required; in any case.
+
+    In any of the units, or without: a measurement in another unit is not ignored but refused.
+    """
+    pattern = rf"({names})([\W_]*({units})\W*)?"
     return any(re.fullmatch(pattern, name, re.IGNORECASE) for name in table.names)
 
 
@@ -397,10 +403,10 @@ _NOT_AT_REST = 0.05
 
 def _verticals(table: CsvTable) -> Array:
     """Upward directions from accelerometers, shape (n, 3); empty without them."""
-    units = [unit for unit in _AT_REST if f"accel_x_{unit}" in table.names]
-    if not units:
+    if not _has(table, "accel_[xyz]", "m_s2|ms2|mps2|g|mg"):
         return _nothing()
-    unit, at_rest = units[0], _AT_REST[units[0]]
+    unit = next((one for one in _AT_REST if _has(table, f"accel_[xyz]_{one}")), "m_s2")
+    at_rest = _AT_REST[unit]
     accelerations = table.of([f"accel_{axis}_{unit}" for axis in "xyz"])
     sizes = np.linalg.norm(accelerations, axis=1)
     wrong = np.flatnonzero(np.abs(sizes / at_rest - 1.0) > _NOT_AT_REST)
@@ -410,38 +416,3 @@ def _verticals(table: CsvTable) -> Array:
         what += f" {sizes[k]:.3g} in magnitude; at rest it is {at_rest:.3g}"
         raise table.bad(what, "check the unit in the names of the columns, and leave out motion")
     return np.asarray(accelerations / sizes[:, None])
-
-
-# Tensions of samples without measured ones, and their uncertainty.
-
-
-def tension_sigma(rig: Rig) -> float:
-    """Standard deviation of tensions that were not measured, [N].
-
-    In a rig that differs from its file, cables pull against each other. None was slack, so the
-    lowest allowed tension is taken to be two standard deviations below the pretension.
-    """
-    return PRETENSION_SHARE * (rig.max_tension - rig.min_tension) / 2.0
-
-
-def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
-    """Measured tensions; where missing, the working tensions of the pose, shape (n, m), [N].
-
-    Where the pose is unknown, or infeasible for the rig file's cables, they are those of home:
-    `tension_sigma` covers both.
-
-    Args:
-        rig: As in its file.
-        measured: Stationary samples.
-
-    Raises:
-        TensionInfeasible: The rig cannot hold its platform at home.
-    """
-    known = np.isfinite(measured.tensions)
-    likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
-    rotations = measured.first_rotations(rig)
-    positions = measured.origins(rotations)
-    for k in np.flatnonzero(measured.has_position & ~known.all(axis=1)):
-        with suppress(TensionInfeasible):
-            likely[k] = working_tensions(rig, Pose(positions[k], rotations[k])).tensions
-    return np.where(known, measured.tensions, likely)

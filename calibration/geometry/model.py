@@ -8,16 +8,18 @@ Each stationary sample has cable lengths and the values of further sensors (`Sen
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.geometry.measurements import RigMeasurements, nominal_tensions, tension_sigma
+from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.parameters import Parameters, RigGeometry, rig_with
 from model.kinematics import Cables, cable_lengths, cables_to
-from model.pose import Array, matrix_from_rotation_vector, skew
+from model.pose import Array, Pose, matrix_from_rotation_vector, skew
 from model.rig import Rig
-from model.statics.gravity import working_tensions
+from model.statics.gravity import PRETENSION_SHARE, working_tensions
+from model.statics.tension_distribution import TensionInfeasible
 from model.winches import WinchMap
 
 
@@ -363,3 +365,38 @@ def _by_pulley_radius(rig: Rig, cables: Cables) -> Array:
     wrapped = (cables.lengths - straight) / radius
     by_radius: Array = wrapped - radius * turning - reach / straight
     return by_radius
+
+
+# Tensions of samples without measured ones, and their uncertainty.
+
+
+def tension_sigma(rig: Rig) -> float:
+    """Standard deviation of tensions that were not measured, [N].
+
+    In a rig that differs from its file, cables pull against each other. None was slack, so the
+    lowest allowed tension is taken to be two standard deviations below the pretension.
+    """
+    return PRETENSION_SHARE * (rig.max_tension - rig.min_tension) / 2.0
+
+
+def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
+    """Measured tensions; where missing, the working tensions of the pose, shape (n, m), [N].
+
+    Where the pose is unknown, or infeasible for the rig file's cables, they are those of home:
+    `tension_sigma` covers both.
+
+    Args:
+        rig: As in its file.
+        measured: Stationary samples.
+
+    Raises:
+        TensionInfeasible: The rig cannot hold its platform at home.
+    """
+    known = np.isfinite(measured.tensions)
+    likely = np.tile(working_tensions(rig, rig.home).tensions, (len(measured), 1))
+    rotations = measured.first_rotations(rig)
+    positions = measured.origins(rotations)
+    for k in np.flatnonzero(measured.has_position & ~known.all(axis=1)):
+        with suppress(TensionInfeasible):
+            likely[k] = working_tensions(rig, Pose(positions[k], rotations[k])).tensions
+    return np.where(known, measured.tensions, likely)

@@ -241,10 +241,10 @@ def fit_camera(
         else:
             views[name] = seen
             previews[name] = _reduced(image)
-            left_out |= {f"{name}, {k}": "is detected more than once" for k in seen.twice}
+    shown = len(views)
     views, left_out = _without_duplicates(views, left_out)
     if size is None or len(views) < LEAST_VIEWS:
-        raise _too_few(views, left_out, board, without.chosen())
+        raise _too_few(len(views), shown, left_out, board, without.chosen())
     found = calibrate_from_views(views, size, left_out, lens)
     return replace(found, previews=previews, board=board)
 
@@ -430,21 +430,20 @@ def _instead(board: Board, without: Sequence[tuple[str, Image]]) -> str:
 
 
 def _too_few(
-    views: Mapping[str, DetectedBoard],
+    different: int,
+    shown: int,
     unused: Mapping[str, str],
     board: Board,
     without: Sequence[tuple[str, Image]],
 ) -> BadInput:
-    count = len(views) + len(unused)
-    why = f"expected {board}{_instead(board, without)}"
     reasons = [f"{name} {reason}" for name, reason in unused.items()]
-    if reasons:
-        more = f" and {len(reasons) - 4} more" if len(reasons) > 5 else ""
-        why += "; " + "; ".join(reasons[: 4 if more else 5]) + more
+    more = f" and {len(reasons) - 4} more" if len(reasons) > 5 else ""
+    listed = [f"expected {board}{_instead(board, without)}", *reasons[: 4 if more else 5]]
+    only = f", only {different} of them different" if different < shown else ""
+    check = "check the board's kind and dimensions, or " if shown < LEAST_VIEWS else ""
     return BadInput(
-        f"the board was found in {len(views)} of {count} images;"
+        f"the board was found in {shown} of {different + len(unused)} images{only};"
         f" at least {LEAST_VIEWS} are required",
-        why=why,
-        next_step="check the board's kind and dimensions, or take more images of it, tilted up to"
-        " 40°; 40 are recommended",
+        why="; ".join(listed) + more,
+        next_step=f"{check}take more images of it, tilted up to 40°; 40 are recommended",
     )

@@ -315,7 +315,6 @@ def _from_keys(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> dict[str
     elif "k" in keys:  # a message of ROS; ROS 1 names its fields K and D
         size = np.concatenate([_at(keys, axis, path) for axis in ("width", "height")])
         matrix, lens = _at(keys, "k", path), "d"
-        _require_whole_image(keys, path)
     elif "intrinsics" in keys:
         size, matrix = (_at(keys, key, path) for key in ("resolution", "intrinsics"))
         lens = "distortion_coefficients"
@@ -323,6 +322,7 @@ def _from_keys(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> dict[str
             raise _unusable(path, f"its camera_model is {model!r}; pinhole can be read")
     else:
         raise _unusable(path, "it has none of the keys camera_matrix, K, intrinsics, cam0")
+    _require_whole_image(keys, size, path)
     (kind, count), is_assumed = _lens_of(keys, path, is_opencv)
     numbers = _at(keys, lens, path)
     if numbers[count:].any():  # some drivers add zeros
@@ -365,11 +365,12 @@ def _at(keys: Mapping[Any, Any], key: str, path: Path, where: str = "") -> Array
     return numbers
 
 
-def _require_whole_image(message: Mapping[Any, Any], path: Path) -> None:
-    """Refuses a message for binned images, or for a part of the image."""
-    roi = message["roi"] if isinstance(message.get("roi"), Mapping) else {}
-    binned = any(message.get(key, 0) not in (0, 1) for key in ("binning_x", "binning_y"))
-    cut = any(roi.get(side) not in (None, 0, message[side]) for side in ("width", "height"))
+def _require_whole_image(keys: Mapping[Any, Any], size: Array, path: Path) -> None:
+    """Refuses a file for binned images, or for a part of the image."""
+    roi = keys["roi"] if isinstance(keys.get("roi"), Mapping) else {}
+    binned = any(keys.get(key) not in (None, 0, 1) for key in ("binning_x", "binning_y"))
+    sides = zip(("width", "height"), size.tolist(), strict=False)  # other sizes are refused later
+    cut = any(roi.get(side) not in (None, 0, whole) for side, whole in sides)
     if binned or cut or roi.get("x_offset") or roi.get("y_offset"):
         raise _unusable(path, "its images are binned, or a part of the sensor's")
 

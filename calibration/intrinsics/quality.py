@@ -12,6 +12,7 @@ from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
 from calibration.results import CalibrationVerdict, Issue
 from calibration.targets.boards import Charuco
 from calibration.targets.grids import TagGrid
+from model.errors import BadInput
 from model.pose import Array, rotation_vector_from_matrix
 from tracking.camera_model import rays_of
 
@@ -100,7 +101,10 @@ def judge_camera(
         result: The calibration.
         wanted: Required error, [m].
         distance: Working distance of the camera, [m]; that of the boards when left out. As that
-            depends on the stated size of the squares, pixels are assessed as well then.
+        depends on the stated size of the squares, pixels are assessed as well then.
+
+    Raises:
+        BadInput: The fitted lens has no ray through a part of the image.
     """
     away = [float(np.linalg.norm(pose.position)) for pose in result.boards.values()]
     distance_given = distance is not None
@@ -111,6 +115,8 @@ def judge_camera(
     error = scale * np.sqrt(2.0) * result.uncertainty.error_of(slopes)  # of both axes
     apart = slopes @ result.uncertainty.halves
     halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    if not np.isfinite([error, halves]).all():
+        raise _unreached(result)
     bow, bent = bow_of(result)
     radial = radial_share(*corner_errors(result), result.matrix)
     issues = [
@@ -132,6 +138,15 @@ def judge_camera(
     nearest, farthest = min(away), max(away)
     return CameraQuality(
         verdict, coverage, tilts, distance, nearest, farthest, halves, bow, bent, radial
+    )
+
+
+def _unreached(result: CameraCalibration) -> BadInput:
+    other = "" if result.lens.name == "five" else ", or fit fewer coefficients with --lens five"
+    return BadInput(
+        f"the fitted lens ({result.lens.name}) has no ray through a part of the image",
+        why="the corners do not determine it there, as with the board always in the middle",
+        next_step=f"{EDGES}{other}",
     )
 
 

@@ -268,6 +268,7 @@ def readout_result(
 
 def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str) -> str:
     """The report page."""
+    unused = {name.partition(", tag ")[0] for name in found.unused} - set(found.speeds)
     images: Sequence[tuple[str, str]] = [
         (name, f"{speed * 1e3:.0f} mm/s") for name, speed in found.speeds.items()
     ]
@@ -277,7 +278,7 @@ def readout_page(found: ReadoutCalibration, verdict: CalibrationVerdict, on: str
     ]
     return page_of(
         f"Readout of camera {found.camera.name}",
-        f"{on}, {len(found.speeds)} images used, {len(found.unused)} not",
+        f"{on}, {len(found.speeds)} images used, {len(unused)} not",
         verdict,
         [
             Section("Readout", table_of([*interval_rows(found.intervals), *errors])),

@@ -90,10 +90,13 @@ def uncertainty_figure(result: CameraCalibration, quality: CameraQuality) -> str
     down = (np.arange(rows) + 0.5) / rows * height
     pixels = np.array([(x, y) for y in down for x in across])
     found = pixel_uncertainty(result, pixels)
-    most, cell = float(found.max()), (_WIDTH / columns, height * scale / rows)
+    least, most = float(np.nanmin(found)), float(np.nanmax(found))  # NaN where no ray is
+    cell = (_WIDTH / columns, height * scale / rows)
     focal = float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
     shapes = []
     for k, (value, (x, y)) in enumerate(zip(found, pixels * scale, strict=True)):
+        if np.isnan(value):
+            continue
         shade = 0.05 + 0.7 * float(np.sqrt(value / max(most, 1e-12)))
         shapes.append(
             f'<rect x="{x - cell[0] / 2:.1f}" y="{y - cell[1] / 2:.1f}" width="{cell[0]:.1f}"'
@@ -105,8 +108,8 @@ def uncertainty_figure(result: CameraCalibration, quality: CameraQuality) -> str
             )
     at = quality.distance / focal * 1e3
     label = (
-        f"Uncertainty of pixels over the image, {found.min():.2g} to {most:.2g} px, which are"
-        f" {found.min() * at:.2g} to {most * at:.2g} mm at {quality.distance:.2g} m."
+        f"Uncertainty of pixels over the image, {least:.2g} to {most:.2g} px, which are"
+        f" {least * at:.2g} to {most * at:.2g} mm at {quality.distance:.2g} m."
     )
     return drawing("".join(shapes), (_WIDTH, height * scale), label) + _caption(label)
 
@@ -312,9 +315,9 @@ def camera_result(
         name: Of the camera in the rig file.
         on: The date.
     """
-    m = result.matrix
+    m, verdict, unused = result.matrix, quality.verdict, _left_out(result)
     return CameraResult(
-        **common_keys(name, on, result.data_hash, result.intervals, quality.verdict, result.unused),
+        **common_keys(name, on, result.data_hash, result.intervals, verdict, unused),
         width_px=result.size[0],
         height_px=result.size[1],
         fx_px=float(m[0, 0]),
@@ -357,6 +360,13 @@ def with_camera(rig: RigDocument, changed: CameraDocument) -> RigDocument:
     return rig.model_copy(update={"cameras": cameras})
 
 
+def _left_out(result: CameraCalibration) -> dict[str, str]:
+    """Why images, and markers in the images used, are not used, by name."""
+    again = "is detected more than once"
+    twice = {f"{name}, {k}": again for name, seen in result.views.items() for k in seen.twice}
+    return {**result.unused, **twice}
+
+
 # Report.
 
 
@@ -391,7 +401,7 @@ def camera_page(result: CameraCalibration, quality: CameraQuality, name: str, da
             *worst_image(result),
             Section("Tilt of the board", tilt_figure(quality), tilted),
             Section("Images used", _image_table(result), used),
-            Section("Images not used", table_of(result.unused.items())),
+            Section("Images not used", table_of(_left_out(result).items())),
         ],
     )
 

@@ -100,7 +100,7 @@ def read_corners(path: Path) -> tuple[dict[str, DetectedBoard], dict[str, str]]:
 
     Raises:
         BadInput: The file cannot be read, a column is missing, a value is not a number, or no
-            image shows `LEAST_POINTS`.
+            image shows `LEAST_POINTS` that are not in one line.
     """
     table = CsvTable(path)
     table.require(_COLUMNS)
@@ -109,16 +109,18 @@ def read_corners(path: Path) -> tuple[dict[str, DetectedBoard], dict[str, str]]:
     for picture, values in zip(pictures, numbers, strict=True):
         found.setdefault(picture, []).append(values)
     seen, unused = {}, {}
-    for picture, corners in found.items():
-        if len(corners) < LEAST_POINTS:
+    for picture, lines in found.items():
+        pixels, board = np.hsplit(np.array(lines), 2)
+        points = np.column_stack([board / 1e3, np.zeros(len(board))])
+        if len(points) < LEAST_POINTS:
             unused[picture] = f"has fewer than {LEAST_POINTS} corners"
-            continue
-        corners_of = np.array(corners)
-        flat = np.column_stack([corners_of[:, 2:] / 1e3, np.zeros(len(corners_of))])
-        seen[picture] = DetectedBoard(read_only(flat), read_only(corners_of[:, :2]))
+        elif _in_a_line(points):
+            unused[picture] = "has corners in one line only"
+        else:
+            seen[picture] = DetectedBoard(read_only(points), read_only(pixels))
     if not seen:
         raise BadInput(
-            f"no image has {LEAST_POINTS} corners",
+            f"no image has {LEAST_POINTS} corners that are not in one line",
             where=str(path),
             next_step="write a line for every corner: its image, pixels and position on the board",
         )
@@ -332,10 +334,7 @@ class Charuco:
         return DetectedBoard(chosen, better[found], twice, side)
 
     def describe_other(self, image: Image) -> str:
-        """The board with rows and columns exchanged, else tags and markers in the image.
-
-        OpenCV's other pattern, too.
-        """
+        """The board rotated or of OpenCV's other pattern, else tags and markers in the image."""
         exchanged = replace(self, columns=self.rows, rows=self.columns)
         for other in (exchanged, replace(exchanged, legacy=not self.legacy)):
             if self.columns != self.rows and other.find(image) is not None:
@@ -445,6 +444,6 @@ def _marker_side(squares: Array, points: Array, corners: Array) -> float:
 
 
 def _in_a_line(points: Array) -> bool:
-    """Whether points are collinear."""
-    flat = points[:, :2] - points[:, :2].mean(axis=0)
-    return bool(np.linalg.svd(flat, compute_uv=False)[1] < 1e-9)
+    """Whether points are collinear, up to rounding."""
+    along, across = np.linalg.svd(points[:, :2] - points[:, :2].mean(axis=0), compute_uv=False)
+    return bool(across <= 1e-4 * along)

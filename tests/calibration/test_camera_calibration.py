@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import date
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from calibration.intrinsics.calibrate import (
     fit_camera,
 )
 from calibration.intrinsics.quality import is_below, judge_camera
-from calibration.intrinsics.result import camera_result
+from calibration.intrinsics.result import camera_page, camera_result
 from calibration.result_files import load_result
 from calibration.results import write_result
 from calibration.statistics import covariance_of, student_factor
@@ -181,6 +182,16 @@ def test_rendered_pictures_are_calibrated_and_useless_ones_named() -> None:
     assert found.unused == {"wall.png": "no board was found in it"}
     assert set(found.view_errors) == {f"{k}.png" for k in range(8)}
     assert found.error < 0.2
+
+
+def test_markers_that_are_seen_twice_are_not_counted_as_images() -> None:
+    """Such as of a rig's tag with a number of the board, visible in every image."""
+    seen = {name: replace(view, twice=(7,)) for name, view in views(6, 0.05).items()}
+    found = calibrate_from_views(seen, SIZE)
+    quality = judge_camera(found, 1e-3)
+    assert "6 images used, 0 not" in camera_page(found, quality, "camera", "2026-01-02")
+    unused = camera_result(found, quality, "camera", date(2026, 1, 2)).unused
+    assert unused == {f"{name}, 7": "is detected more than once" for name in seen}
 
 
 def test_too_few_pictures_are_refused() -> None:

@@ -112,6 +112,12 @@ k: [461.5, 0.0, 362.5, 0.0, 460.25, 246.0, 0.0, 0.0, 1.0]
 ---
 """
 LATER = MESSAGE.replace("sec: 1", "sec: 3")
+WHOLE = "binning_x: null\nbinning_y: 1\nroi: null\n"
+PARTS = (
+    "binning_x: 2\n",
+    "roi: {x_offset: 100, y_offset: 0, height: 480, width: 752}\n",
+    "roi: {height: 240, width: 752}\n",
+)
 FOREIGN = {
     "equidistant": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "equidistant"), "fisheye", FOUR),
     "fisheye": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "fisheye"), "fisheye", FOUR),
@@ -125,6 +131,7 @@ FOREIGN = {
     "a flat list": (PLAIN + "distortion_model: plumb_bob\n", "pinhole", FIVE),
     "EuRoC": (EUROC, "pinhole", FOUR),
     "a message": (MESSAGE, "pinhole", FIVE),
+    "a message without binning": (MESSAGE.replace("---", WHOLE + "---"), "pinhole", FIVE),
     "three messages": (MESSAGE + LATER + MESSAGE, "pinhole", FIVE),
     "a comment before": ("# from the lab\n---\n" + MESSAGE, "pinhole", FIVE),
     "plumb_bob with zeros": (MESSAGE.replace("0.5]", "0.5, 0, 0, 0.0]"), "pinhole", FIVE),
@@ -153,6 +160,7 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
         (PLAIN.replace("distortion_co", "co"), "distortion_coefficients is missing: a list of num"),
         (PLAIN.replace("[-0.28, 0.07", "[a, b"), "distortion_coefficients is not a list of num"),
         (PLAIN.replace("data", "date"), "camera_matrix is not nine numbers, or rows, cols"),
+        *((PLAIN + part, "its images are binned, or a part of the sensor's") for part in PARTS),
         (PLAIN.replace("752", "wide"), "image_width is not a number of pixels"),
         (PLAIN.replace(STATED, MATLAB), "it is transposed, as in MATLAB"),
         (PLAIN.replace(STATED, "[461.5, 0, 0, 1, 460.25, 0, 362, 246, 1]"), "it is transposed, as"),

@@ -1,4 +1,4 @@
-"""Rig calibration from positions of one point, as from trackers with one reflector."""
+"""Rig calibration from positions of one point, as of a tracker's reflector or target."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from calibration.geometry.measurements import RigMeasurements, read_rig_data
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
 from calibration.geometry.result import rig_result
+from calibration.procedures import calibrate_rig
+from calibration.run_data import rig_measurements
 from model.errors import BadInput
 from model.pose import matrix_from_rotation_vector, read_only
 from model.rig import Rig, load_rig, rig_from_document
@@ -23,6 +25,7 @@ from tests.calibration.rig_places import (
     samples,
     share_inside,
     true_numbers,
+    write_samples,
 )
 from tests.calibration.test_rig_calibration import LENGTH_DEVIATION, TODAY, errors_of, rms
 from tests.cli.program import call
@@ -49,8 +52,65 @@ def followed(truth: Truth, reflector: np.ndarray) -> RigMeasurements:
         data,
         positions=read_only(points),
         rotations=read_only(np.full_like(data.rotations, np.nan)),
-        reflector=read_only(reflector),
+        reflectors=read_only(reflector),
     )
+
+
+def targeted(truth: Truth) -> RigMeasurements:
+    """The same poses as by a tracker of a target, with correlated errors at the target."""
+    data = truth.measured
+    arms = data.rotations @ REFLECTOR
+    to_target = np.tile(np.eye(6), (len(data), 1, 1))
+    to_target[:, :3, 3:] = np.cross(arms[:, None], np.eye(3))
+    return replace(
+        data,
+        positions=read_only(data.positions + arms),
+        covariances=to_target @ data.covariances @ np.swapaxes(to_target, 1, 2),
+        reflectors=read_only(REFLECTOR),
+    )
+
+
+def test_poses_of_a_target_calibrate_a_rig_as_those_of_the_origin(rig: Rig, truth: Truth) -> None:
+    parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
+    by_origin, by_target = (
+        RigFitter(parameters, data, LENGTH_DEVIATION).fit()
+        for data in (truth.measured, targeted(truth))
+    )
+    deviations = parameters.deviations
+    np.testing.assert_allclose(
+        by_target.values / deviations, by_origin.values / deviations, atol=0.01
+    )
+    np.testing.assert_allclose(by_target.information, by_origin.information, rtol=0.02, atol=10.0)
+
+
+def test_errors_common_to_all_poses_of_a_target_move_the_origin_about_it(
+    rig: Rig, truth: Truth
+) -> None:
+    """A target mounted askew displaces the origin by its distance; a rotated world does not."""
+    by_origin = truth.measured.with_added_deviation(1e-4, 1e-3).common_errors
+    by_target = targeted(truth).with_added_deviation(1e-4, 1e-3).common_errors
+    np.testing.assert_allclose(by_target[..., :6], by_origin[..., :6], atol=1e-12)
+    turned = np.array([matrix_from_rotation_vector(1e-3 * axis) for axis in np.eye(3)])
+    for k, rotation in enumerate(truth.measured.rotations[:5]):
+        there = -np.array([(turn - np.eye(3)) @ rotation @ REFLECTOR for turn in turned]).T
+        np.testing.assert_allclose(by_target[k, :3, 6:], there, atol=1e-7)
+
+
+def test_a_reflector_that_no_sample_uses_is_refused(rig: Rig, truth: Truth, tmp_path: Path) -> None:
+    posed, lengths, points = (tmp_path / f"{name}.csv" for name in ("posed", "lengths", "points"))
+    write_samples(posed, truth.measured)
+    write_samples(lengths, truth.measured, poses=False)
+    rows = [line.split(",") for line in posed.read_text().splitlines()]
+    points.write_text("\n".join(",".join(row[:-4]) for row in rows))
+    for data, without_poses in ((lengths, False), (posed, True)):
+        with pytest.raises(BadInput, match="none are used"):
+            calibrate_rig(rig, data, reflector=REFLECTOR, without_poses=without_poses)
+    with pytest.raises(BadInput, match="only some of the CSV files have rotations"):
+        calibrate_rig(rig, [posed, points], reflector=REFLECTOR)
+    _, measured = rig_measurements(rig, [posed], REFLECTOR)
+    origins = measured.origins(measured.rotations)
+    arms = truth.measured.rotations @ REFLECTOR
+    np.testing.assert_allclose(origins, truth.measured.positions - arms, atol=1e-8)
 
 
 @pytest.mark.parametrize("reflector", [np.zeros(3), REFLECTOR])
@@ -67,16 +127,19 @@ def test_positions_of_a_reflector_calibrate_a_rig(
 
 def test_a_wrong_reflector_fits_worse(rig: Rig, truth: Truth) -> None:
     right = followed(truth, REFLECTOR)
-    wrong = replace(right, reflector=read_only(np.zeros(3)))
+    wrong = replace(right, reflectors=read_only(np.zeros(3)))
     parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
     fits = [RigFitter(parameters, data, LENGTH_DEVIATION).fit() for data in (right, wrong)]
     squares = [float(np.sum(f.residuals**2) + np.sum(f.pose_misfits**2)) for f in fits]
     assert squares[1] > 2.0 * squares[0]
 
 
-def test_what_a_position_says_of_a_pose_is_by_finite_differences(rig: Rig, truth: Truth) -> None:
+@pytest.mark.parametrize("rotated", [False, True])
+def test_what_a_position_says_of_a_pose_is_by_finite_differences(
+    rig: Rig, truth: Truth, rotated: bool
+) -> None:
     """The gradient of the squared distances, at estimated poses."""
-    data = followed(truth, REFLECTOR)
+    data = targeted(truth) if rotated else followed(truth, REFLECTOR)
     positions, rotations = truth.positions + 1e-3, truth.rotations
     errors = data.pose_errors(positions, rotations)
     information = data.pose_information(rotations)
@@ -85,7 +148,11 @@ def test_what_a_position_says_of_a_pose_is_by_finite_differences(rig: Rig, truth
     for axis, twist in enumerate(step * np.eye(6)):
         turned = matrix_from_rotation_vector(twist[3:]) @ rotations
         there = data.pose_errors(positions + twist[:3], turned)
-        costs = [np.einsum("ni,nij,nj->n", e, information, e) for e in (there, errors)]
+        after = data.pose_information(turned)
+        costs = [
+            np.einsum("ni,nij,nj->n", e, own, e)
+            for e, own in ((there, after), (errors, information))
+        ]
         found, level = (costs[0] - costs[1]) / step, 1e-3 * np.abs(slopes[:, axis]).max()
         np.testing.assert_allclose(found, slopes[:, axis], rtol=1e-2, atol=level)
 

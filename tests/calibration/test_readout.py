@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from calibration.intrinsics.readout import readout_page
 from calibration.procedures import measure_readout
 from calibration.result_files import load_result
 from model.errors import BadInput
@@ -58,6 +59,9 @@ def film(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: Path) -> None:
     made = measure_readout(rig, rig.cameras[0], film, rate=RATE)
     found = made.found
+    twice = {f"{name}, tag 3": "is detected more than once" for name in found.speeds}
+    page = readout_page(replace(found, unused={**twice, "x": "no pose"}), made.quality, "today")
+    assert f"{len(found.speeds)} images used, 1 not" in page
     assert abs(found.readout - TRUE) < found.half_width
     assert found.half_width < 0.05 * TRUE
     assert len(found.speeds) == 22

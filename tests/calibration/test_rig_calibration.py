@@ -28,10 +28,13 @@ from calibration.geometry.measurements import (
     RigMeasurements,
     at_rest,
     joined,
+)
+from calibration.geometry.model import (
+    CountedLengths,
+    RigModel,
     nominal_tensions,
     tension_sigma,
 )
-from calibration.geometry.model import CountedLengths, RigModel
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import (
     estimate_cable_compliances,
@@ -283,7 +286,7 @@ def test_missing_tensions_are_those_of_the_platform_not_of_its_reflector(
     )
     reflector = np.array([0.02, -0.03, 0.09])
     points = level.positions + rig.home.rotation @ reflector
-    followed = replace(level, positions=points, reflector=reflector)
+    followed = replace(level, positions=points, reflectors=reflector)
     np.testing.assert_allclose(nominal_tensions(rig, followed), nominal_tensions(rig, level))
 
 
@@ -637,7 +640,7 @@ def test_poses_at_the_edge_of_a_suspended_rig_may_be_a_little_outside(
         tilted.measured,
         positions=positions - [0.0, 0.0, 0.2],
         rotations=np.full_like(tilted.measured.rotations, np.nan),
-        reflector=np.array([0.0, 0.0, -0.2]),
+        reflectors=np.array([0.0, 0.0, -0.2]),
     )
     _require_within(suspended, below)
     for scale in (1e3, 25.4, 10.0, 1.0 / 25.4, 1e-3):

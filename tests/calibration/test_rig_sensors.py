@@ -299,6 +299,32 @@ def test_an_acceleration_that_is_not_gravitys_is_refused(
         read_rig_data(written(tmp_path / "wrong.csv", data, "m_s2", 1.0), 10)
 
 
+@pytest.mark.parametrize(
+    ("names", "missing"),
+    [
+        *((names, "'x_mm', 'y_mm', 'z_mm'") for names in ("x_m,y_m,z_m", "x,y,z", "X [inch]")),
+        ("qw,qx,qy,qz", "'x_mm', 'y_mm', 'z_mm'"),
+        ("x_mm,y_mm,z_mm,q_w,q_x,q_y,q_z", "'qw', 'qx', 'qy', 'qz'"),
+        ("tension_1_kn,tension_2_kn", "'tension_1_n', 'tension_2_n'"),
+        ("swivel_1_rad", "'swivel_1_deg', 'swivel_2_deg'"),
+        ("accel_x,accel_y,accel_z", "'accel_x_m_s2', 'accel_y_m_s2', 'accel_z_m_s2'"),
+        ("accel_y_g,accel_z_g", "'accel_x_g'"),
+    ],
+)
+def test_a_measurement_in_another_unit_is_refused_with_the_columns(
+    tmp_path: Path, names: str, missing: str
+) -> None:
+    """Not ignored, as other columns are."""
+    path = tmp_path / "samples.csv"
+    head = f"actual_1_counts,actual_2_counts,temperature,encoder_x_m,x_axis,{names}"
+    path.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
+    with pytest.raises(BadInput, match=f"{missing}.* missing") as caught:
+        read_rig_data(path, 2)
+    assert (
+        caught.value.next_step == f"name it in the first line, which has: {head.replace(',', ', ')}"
+    )
+
+
 def test_the_program_finds_and_applies_them(
     rig: Rig, built: BuiltRig, data: RigMeasurements, tmp_path: Path
 ) -> None:

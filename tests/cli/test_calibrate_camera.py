@@ -122,8 +122,9 @@ def test_one_picture_many_times_is_never_good_enough(tmp_path) -> None:
     for k, image in enumerate(pictures(1, 0.0) * 8):
         save(tmp_path / f"{k}.png", image)
     answer = call("calibrate", "camera", tmp_path, *BOARD)
-    one_message(answer, 2, "found in 1 of 8 images", "1.png duplicates 0.png")
+    one_message(answer, 2, "in 8 of 8 images, only 1 of them different", "1.png duplicates 0.png")
     assert "tilt" in answer.said
+    assert "dimensions" not in answer.said
 
 
 def test_a_board_with_another_number_of_corners_is_reported(tmp_path) -> None:

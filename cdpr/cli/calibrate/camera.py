@@ -77,6 +77,13 @@ def camera(
                 where=str(folder),
                 next_step="pass the width and height of the images that show the corners",
             )
+        if printed != BoardOptions() or pictures is not None:
+            raise BadInput(
+                "a file of corners takes no board and no --pictures",
+                where=str(folder),
+                why="board_x_mm and board_y_mm in it are positions on the board",
+                next_step="leave these options out, and write the positions in mm",
+            )
         result.show(calibrate_camera_from_corners(folder, size_px, **calibrated))
         return
     board = printed.made()

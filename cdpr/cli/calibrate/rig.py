@@ -167,7 +167,7 @@ def rig(
     ),
     without_poses: bool = flag("use drive positions alone, without camera poses"),
     reflector_mm: Triple = option(
-        "point whose positions a file without rotations contains, in the platform frame",
+        "point whose positions the CSV files contain, in the platform frame",
         default=(0.0, 0.0, 0.0),
     ),
     known: list[GroupName] | None = option("parameters to keep as in the rig file; repeatable"),
