@@ -139,7 +139,7 @@ def plan(
     settings = settings_from_options(search.with_seed(seed))
     of_legs = search.rounds if search.rounds and len(search.rounds) > 1 else []
     listener = Terminal(quiet=as_json)
-    listener.remarks(the_rig.document.remarks(), the_scene.document.remarks())
+    listener.remarks(the_scene.remarks(the_rig))
     document = plan_path(the_rig, the_scene, settings, listener, rounds=of_legs, done=done)
     save_plan(document, output)
     more = "".join(f" --calibration {quote(str(file))}" for file in calibration or [])

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from model.errors import BadInput, InvalidFile
 from model.files.scene_file import Payload, StopDocument, payloads
 from model.plan import load_plan, sealed
+from model.rig import load_rig
 from model.scene import legs_of, load_scene
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
 from tests.model.test_plan_file import DOCUMENT
@@ -176,3 +177,18 @@ def test_a_plan_whose_marks_are_not_the_scenes_stops_is_refused(
     with pytest.raises(BadInput) as caught:
         load_plan(path)
     assert words in caught.value.what
+
+
+def test_a_payload_with_its_centre_outside_the_platform_gets_a_remark() -> None:
+    """The box of 130 mm and the cables are all that is kept away from obstacles."""
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml")
+    scene = load_scene(CONFIGS / "pick_and_place.yaml")
+    below = "mass_centre_mm is 15 mm outside the platform's box"
+    remarks = scene.remarks(rig)
+    assert len(remarks) == sum(stop.kind == "pick" for stop in scene.stops) == 2
+    assert all(below in remark for remark in remarks)
+    inside = [stop.model_copy(update={"mass_centre_mm": None}) for stop in scene.document.stops]
+    assert scene.changed(stops=inside).remarks(rig) == []
+    [first] = scene.changed(stops=[], payload=Payload(1.0, (0.0, 70.0, 0.0))).remarks(rig)
+    assert first.startswith("load.payload_centre_mm is 5 mm outside the platform's box")
+    assert scene.changed(stops=[], payload=Payload(0.0, (0.0, 70.0, 0.0))).remarks(rig) == []
