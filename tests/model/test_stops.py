@@ -120,7 +120,7 @@ def test_a_placed_mass_without_a_centre_takes_from_all_that_is_carried_alike() -
 def test_every_leg_has_its_ends_and_its_load() -> None:
     scene = load_scene(CONFIGS / "pick_and_place.yaml")
     legs = legs_of(scene)
-    assert [leg.scene.load.payload_mass for leg in legs] == [0.0, 1.2, 1.2, 0.0, 0.5, 0.0]
+    assert [leg.scene.load.payload_mass for leg in legs] == [0.0, 1.2, 1.2, 0.0, 0.5, 0.5, 0.0]
     np.testing.assert_allclose(legs[1].scene.load.payload_centre, [0.0, 0.0, -0.08])
     poses = [scene.start, *(s.pose for s in scene.stops), scene.goal]
     for leg, start, goal in zip(legs, poses[:-1], poses[1:], strict=True):
@@ -146,7 +146,7 @@ def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
     with pytest.raises(BadInput, match=r"'shelf' puts down 1\.2 kg, but only 0 kg are carried"):
         scene.changed(stops=later)
     changed = scene.changed(stops=later, payload=Payload(1.2, (0.0, 0.0, -80.0)))
-    assert len(changed.stops) == 3
+    assert len(changed.stops) == 4
 
 
 @pytest.mark.parametrize(
