@@ -139,6 +139,24 @@ class Scene(ReadOnly):
         """Hash of the scene's content."""
         return document_hash(self.document)
 
+    def remarks(self, rig: Rig) -> list[str]:
+        """Values of the files of rig and scene that are valid but unlikely, each with its key."""
+        load, half = self.document.load, np.array(rig.document.platform.size_mm) / 2.0
+        masses = [("load.payload_centre_mm", load.payload_kg, load.payload_centre_mm)]
+        masses += [
+            (f"stops[{i}].mass_centre_mm", stop.mass_kg or 0.0, stop.mass_centre_mm or [0.0] * 3)
+            for i, stop in enumerate(self.document.stops)
+            if stop.kind == "pick"
+        ]
+        found = [(key, float(np.max(np.abs(at) - half))) for key, mass, at in masses if mass > 0.0]
+        carried = [
+            f"{key} is {outside:.4g} mm outside the platform's box; only this box and the cables"
+            " are kept away from obstacles"
+            for key, outside in found
+            if outside > 0.0
+        ]
+        return [*rig.document.remarks(), *self.document.remarks(), *carried]
+
     def stop_facts(self) -> list[tuple[str, str]]:
         """Human-readable summary of the stops and the load after each; empty without stops."""
         carried = [leg.scene.load.payload_mass for leg in legs_of(self)]

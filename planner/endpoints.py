@@ -7,12 +7,14 @@ from math import comb
 import numpy as np
 
 from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_name
+from model.distances import convex_bodies, separation
 from model.errors import BadInput, distinct_figures
 from model.files.new_rig import CABLES_MOST
 from model.kinematics import axis_distances, structure_matrix
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Leg, Scene, legs_of
+from model.shapes import Sphere
 from model.statics.feasibility import limiting_cables
 from model.statics.gravity import inertial_wrench
 from model.statics.tension_distribution import remedy
@@ -197,7 +199,34 @@ def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -
     for near, asked, key in pairs:
         needed = asked + CLEARANCE_RESERVE
         if near.distance < needed:
+            if key == "obstacle_mm":
+                _require_clear_outlet(model.rig, scene, near, needed)
             raise _clearance_error(name, near, needed, key, model.rig)
+
+
+def _require_clear_outlet(rig: Rig, scene: Scene, near: Nearest, needed: float) -> None:
+    """Refuses an obstacle so near to a cable's outlet that the cable is too near at every pose."""
+    names = [cable_name(cable) for cable in range(rig.cable_count)]
+    if rig.pulley_radius or near.first not in names:  # the exit moves along the pulley
+        return
+    outlet = Pose.level(rig.outlets[names.index(near.first)])
+    [end] = convex_bodies(Sphere(rig.cable_radius), outlet)
+    [obstacle] = (one for one in scene.obstacles if one.name == near.second)
+    parts = convex_bodies(obstacle.shape, obstacle.pose)
+    distance = min(separation(end, part).distance for part in parts)
+    if distance >= needed:
+        return
+    gap, least = distinct_figures((distance * 1e3, needed * 1e3), 2)
+    where = f"{gap} mm from it" if distance > 0.0 else "in it"
+    reduced = ", or reduce clearance.obstacle_mm in the scene" if distance > 0.0 else ""
+    raise BadInput(
+        f"at no pose does {near.first} keep {least} mm from {near.second}: its outlet is {where}",
+        where=f"scene {scene.name}",
+        why="every cable begins at its outlet",
+        next_step=f"let {near.second} end short of the outlet, leave it out if the platform cannot"
+        f" reach it{reduced}",
+        values={"distance_mm": distance * 1e3, "required_mm": needed * 1e3, "pair": _pair(near)},
+    )
 
 
 def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig) -> BadInput:

@@ -34,7 +34,7 @@ def check(
     the_rig = the_plan.rig if rig is None else load_rig(rig)
     require_same_rig(the_plan, the_rig, plan)
     terminal = Terminal(quiet=as_json)
-    terminal.remarks(the_rig.document.remarks(), the_plan.scene.document.remarks())
+    terminal.remarks(the_plan.scene.remarks(the_rig))
     with terminal.waiting("checking"):
         report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
     if as_json:

@@ -19,7 +19,6 @@ from cdpr.cli.options import (
     SCENE,
     Triple,
     calibrated_rig,
-    level_pose,
 )
 from cdpr.cli.output import Terminal, present
 from executor.recording.resume import passing, scene_after
@@ -97,10 +96,11 @@ def plan(
     calibration: list[Path] | None = CALIBRATION,
     clearance_mm: float | None = option("obstacle clearance, overriding the scene's", min=0.0),
     search: SearchOptions,
-    start_mm: Triple | None = option("start position x y z, overriding the scene's"),
-    goal_mm: Triple | None = option("goal position x y z, overriding the scene's"),
+    start_mm: Triple | None = option("start position x y z, in the scene's start orientation"),
+    goal_mm: Triple | None = option("goal position x y z, in the scene's goal orientation"),
     via_mm: list[str] | None = option(
-        "position x y z to pass before the scene's stops; repeatable", metavar="X Y Z"
+        "position x y z to pass, in the start's orientation, before the scene's stops; repeatable",
+        metavar="X Y Z",
     ),
     from_run: Path | None = option(
         "start where this run ended, with the remaining stops", metavar="RUNDIR"
@@ -124,9 +124,10 @@ def plan(
         raise BadInput(
             "--from-run and --start-mm contradict each other", next_step="leave out one of them"
         )
-    the_scene = load_scene(scene).changed(
-        start=level_pose(start_mm),
-        goal=level_pose(goal_mm),
+    the_scene = load_scene(scene)
+    the_scene = the_scene.changed(
+        start=None if start_mm is None else _at(start_mm, the_scene.start),
+        goal=None if goal_mm is None else _at(goal_mm, the_scene.goal),
         clearance=None if clearance_mm is None else clearance_mm / 1000.0,
     )
     done: Sequence[StopDocument] = ()
@@ -134,12 +135,12 @@ def plan(
     if from_run is not None:
         the_scene, done, end = scene_after(the_scene, the_rig, from_run)
         begun = end.facts(from_run, len(done), len(the_scene.stops))
-    the_scene = passing(the_scene, [_via_point(text) for text in via_mm or []])
+    the_scene = passing(the_scene, [_via_pose(text, the_scene.start) for text in via_mm or []])
     require_new_file(output, force)
     settings = settings_from_options(search.with_seed(seed))
     of_legs = search.rounds if search.rounds and len(search.rounds) > 1 else []
     listener = Terminal(quiet=as_json)
-    listener.remarks(the_rig.document.remarks(), the_scene.document.remarks())
+    listener.remarks(the_scene.remarks(the_rig))
     document = plan_path(the_rig, the_scene, settings, listener, rounds=of_legs, done=done)
     save_plan(document, output)
     more = "".join(f" --calibration {quote(str(file))}" for file in calibration or [])
@@ -190,8 +191,13 @@ def _weights(texts: Sequence[str]) -> dict[str, float]:
     return read
 
 
-def _via_point(text: str) -> Pose:
-    """The level pose at ``x y z``.
+def _at(position_mm: Triple, other: Pose) -> Pose:
+    """The pose at an option's position x y z, with the orientation of another."""
+    return Pose(millimetres(list(position_mm)), other.rotation)
+
+
+def _via_pose(text: str, start: Pose) -> Pose:
+    """The pose at ``x y z``, with the start's orientation.
 
     Raises:
         BadInput: It cannot be read.
@@ -204,4 +210,4 @@ def _via_point(text: str) -> Pose:
         raise BadInput(what, next_step=hint) from None
     if not all(map(math.isfinite, (x, y, z))):
         raise BadInput(f"--via-mm {text}: finite numbers are required", next_step=hint)
-    return Pose.level(millimetres([x, y, z]))
+    return _at((x, y, z), start)

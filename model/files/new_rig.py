@@ -245,7 +245,7 @@ def _geometry_problems(answers: Answers) -> list[str]:
 
 _PLATFORM = RigQuestion(
     "platform_mm",
-    "platform size X Y Z",
+    "platform size X Y Z, a box about the origin of its frame",
     "mm",
     _point(Positive),
     lambda answers: answers.get("platform_mm", [130.0] * 3),

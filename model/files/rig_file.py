@@ -318,18 +318,19 @@ class RigDocument(Document):
 
     def remarks(self) -> list[str]:
         """Values that are valid but unlikely, each with its key."""
-        longest, span = max(self.platform.size_mm), _span(self.anchors_mm)
-        middle = float(np.linalg.norm(np.mean(self.anchors_mm, axis=0)))
+        edges, span = self.platform.size_mm, _span(self.anchors_mm)
         box = (
-            f"platform.size_mm: the longest edge is {longest:g} mm, but the anchors span {span:g}"
-            " mm; only this box and the cables are kept away from obstacles"
+            f"platform.size_mm: the longest edge is {max(edges):g} mm, but the anchors span"
+            f" {span:g} mm; only this box and the cables are kept away from obstacles"
         )
-        frame = (
-            f"anchors_mm: their centre is {middle:.5g} mm from the platform's origin, about which"
-            " the box is; check that they are in the platform frame, not the world frame"
-        )
-        unlikely = {box: span > 20 * longest, frame: middle > 2 * max(span, longest)}
-        return [text for text, applies in unlikely.items() if applies]
+        found = [box] if span > 20 * max(edges) else []
+        for axis, edge, ends in zip("xyz", edges, np.transpose(self.anchors_mm), strict=True):
+            middle = abs(ends.min() + ends.max()) / 2
+            if middle > edge / 4 and np.abs(ends).max() > 0.75 * edge:  # not eyebolts on the box
+                where = f"along {axis} their middle is {middle:.5g} mm from the platform's origin"
+                hint = "about which the box is; give them in a frame at the box's centre"
+                found.append(f"anchors_mm: {where}, {hint}")
+        return found
 
     def _a_winch_each(self) -> list[Finding]:
         return self._one_each(("winches",), len(self.winches))

@@ -62,7 +62,8 @@ def test_enter_for_every_question_makes_a_rig_that_can_be_planned_and_looked_at(
 
 def test_each_question_shows_its_default_and_its_unit(tmp_path: Path) -> None:
     answer = call("new", tmp_path / "rig.yaml", answers="\n" * 50)
-    assert "platform size X Y Z [130 130 130] mm: " in answer.err
+    question = "platform size X Y Z, a box about the origin of its frame [130 130 130] mm: "
+    assert question in answer.err
     assert "mass of the platform [0.4] kg: " in answer.err
     assert "largest tension of a cable [100] N: " in answer.err
 
@@ -290,7 +291,7 @@ def test_anchors_in_the_world_frame_get_a_remark_from_new_and_doctor(tmp_path: P
     rig = tmp_path / "rig.yaml"
     for answer in (call("new", rig, "--from", table), call("doctor", rig)):
         assert answer.code == 0, answer
-        assert "remark anchors_mm: their centre is 445 mm from the platform's origin" in answer.err
+        assert "remark anchors_mm: along z their middle is 445 mm from the platform's" in answer.err
 
 
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message
@@ -81,3 +82,24 @@ def test_a_budget_that_only_the_least_rounds_exceed_is_reported(tmp_path: Path) 
         assert answer.code == 0, answer
         assert "only the minimum" not in answer.said
     assert json.loads((tmp_path / "a.json").read_text())["planner"]["rounds"] == [12]
+
+
+def test_positions_of_options_keep_the_orientations_of_the_scene(tmp_path: Path) -> None:
+    """With the platform frame, and so the home, rotated by 90° about the vertical."""
+    half = 0.5**0.5
+    rotated = {"rotation_wxyz": [half, 0.0, 0.0, half]}
+    data = yaml.safe_load(RIG.read_text())
+    data["platform"]["home"] |= rotated
+    data["anchors_mm"] = [[y, -x, z] for x, y, z in data["anchors_mm"]]
+    rig, scene, plan = (tmp_path / name for name in ("rig.yaml", "scene.yaml", "plan.json"))
+    rig.write_text(yaml.safe_dump(data))
+    ends = {"start": [180, 180, 300], "goal": [-180, -180, 400]}
+    poses = {name: {"position_mm": at, **rotated} for name, at in ends.items()}
+    scene.write_text(yaml.safe_dump({"schema_version": 1, "name": "rotated", **poses}))
+    positions = ["--start-mm", 0, 0, 445, "--via-mm", 50, 0, 420, "--goal-mm", 100, 0, 400]
+    answer = call("plan", rig, scene, "-o", plan, "--rounds", 1, *positions)
+    assert answer.code == 0, answer
+    waypoints = json.loads(plan.read_text())["waypoints"]
+    passed = [point["position_mm"] for point in waypoints]
+    assert passed == [positions[1:4], positions[5:8], positions[9:12]]
+    assert all(point["rotation_wxyz"] == pytest.approx([half, 0, 0, half]) for point in waypoints)

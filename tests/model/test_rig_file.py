@@ -537,10 +537,21 @@ def test_anchors_in_the_world_frame_and_a_tiny_box_get_a_remark() -> None:
     world, box = paper_data(), paper_data()
     world["anchors_mm"] = [[x, y, z + 445.0] for x, y, z in world["anchors_mm"]]
     [of_world] = rig_of(world).document.remarks()
-    assert of_world.startswith("anchors_mm: their centre is 445 mm from the platform's origin")
+    assert of_world.startswith("anchors_mm: along z their middle is 445 mm from the platform's")
     box["platform"]["size_mm"] = [5.0, 5.0, 5.0]
     [of_box] = rig_of(box).document.remarks()
     assert of_box.startswith("platform.size_mm: the longest edge is 5 mm, but the anchors span 130")
+
+
+def test_a_frame_at_the_bottom_of_the_platform_gets_a_remark_but_not_eyebolts() -> None:
+    """The box is about the frame: half of a cube with its frame at the bottom is outside it."""
+    data, bolts = paper_data(), paper_data()
+    half = data["platform"]["size_mm"][2] / 2.0
+    data["anchors_mm"] = [[x, y, z + half] for x, y, z in data["anchors_mm"]]
+    [remark] = rig_of(data).document.remarks()
+    assert remark.startswith(f"anchors_mm: along z their middle is {half:g} mm from the platform's")
+    bolts["anchors_mm"] = [[x, y, half + 15.0] for x, y, _ in bolts["anchors_mm"]]
+    assert rig_of(bolts).document.remarks() == []
 
 
 def test_a_point_mass_is_refused_with_its_line(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from model.errors import BadInput, InvalidFile
 from model.files.scene_file import Payload, StopDocument, payloads
 from model.plan import load_plan, sealed
+from model.rig import load_rig
 from model.scene import legs_of, load_scene
 from tests.model.rig_builds import CONFIGS, scene_data, scene_of
 from tests.model.test_plan_file import DOCUMENT
@@ -119,7 +120,7 @@ def test_a_placed_mass_without_a_centre_takes_from_all_that_is_carried_alike() -
 def test_every_leg_has_its_ends_and_its_load() -> None:
     scene = load_scene(CONFIGS / "pick_and_place.yaml")
     legs = legs_of(scene)
-    assert [leg.scene.load.payload_mass for leg in legs] == [0.0, 1.2, 1.2, 0.0, 0.5, 0.0]
+    assert [leg.scene.load.payload_mass for leg in legs] == [0.0, 1.2, 1.2, 0.0, 0.5, 0.5, 0.0]
     np.testing.assert_allclose(legs[1].scene.load.payload_centre, [0.0, 0.0, -0.08])
     poses = [scene.start, *(s.pose for s in scene.stops), scene.goal]
     for leg, start, goal in zip(legs, poses[:-1], poses[1:], strict=True):
@@ -145,7 +146,7 @@ def test_a_payload_that_does_not_fit_the_stops_is_refused() -> None:
     with pytest.raises(BadInput, match=r"'shelf' puts down 1\.2 kg, but only 0 kg are carried"):
         scene.changed(stops=later)
     changed = scene.changed(stops=later, payload=Payload(1.2, (0.0, 0.0, -80.0)))
-    assert len(changed.stops) == 3
+    assert len(changed.stops) == 4
 
 
 @pytest.mark.parametrize(
@@ -176,3 +177,18 @@ def test_a_plan_whose_marks_are_not_the_scenes_stops_is_refused(
     with pytest.raises(BadInput) as caught:
         load_plan(path)
     assert words in caught.value.what
+
+
+def test_a_payload_with_its_centre_outside_the_platform_gets_a_remark() -> None:
+    """The box of 130 mm and the cables are all that is kept away from obstacles."""
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml")
+    scene = load_scene(CONFIGS / "pick_and_place.yaml")
+    below = "mass_centre_mm is 15 mm outside the platform's box"
+    remarks = scene.remarks(rig)
+    assert len(remarks) == sum(stop.kind == "pick" for stop in scene.stops) == 2
+    assert all(below in remark for remark in remarks)
+    inside = [stop.model_copy(update={"mass_centre_mm": None}) for stop in scene.document.stops]
+    assert scene.changed(stops=inside).remarks(rig) == []
+    [first] = scene.changed(stops=[], payload=Payload(1.0, (0.0, 70.0, 0.0))).remarks(rig)
+    assert first.startswith("load.payload_centre_mm is 5 mm outside the platform's box")
+    assert scene.changed(stops=[], payload=Payload(0.0, (0.0, 70.0, 0.0))).remarks(rig) == []

@@ -300,6 +300,25 @@ def test_anchors_inside_the_platforms_box_are_named(gachon, scene_with, share, w
     assert all(word in str(refusal.value) for word in words)
 
 
+@pytest.mark.parametrize(
+    ("y_mm", "words", "reduced"),
+    [(545.0, "its outlet is 0.67 mm from it", True), (524.3, "its outlet is in it", False)],
+)
+def test_an_obstacle_at_an_outlet_is_named_instead_of_the_start(
+    gachon, scene_with, y_mm, words, reduced
+) -> None:
+    """A post of the frame beside outlet 1, at [-437, 524.3, …] mm."""
+    box = {"size_mm": [40.0, 40.0, 900.0]}
+    post = {"name": "post", "box": box, "position_mm": [-437.0, y_mm, 450.0]}
+    with pytest.raises(
+        BadInput, match=r"at no pose does cable 1 keep 10\.05 mm from post"
+    ) as refusal:
+        require_usable_ends(gachon, scene_with(post))
+    assert words in refusal.value.what
+    assert "move the start" not in refusal.value.next_step
+    assert ("reduce clearance.obstacle_mm" in refusal.value.next_step) == reduced
+
+
 def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_with) -> None:
     """Crossing cables may be moved apart; those from one anchor are near whatever the pose."""
     crossing = replace(scene_with(), self_clearance=0.017)

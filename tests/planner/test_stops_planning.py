@@ -8,11 +8,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from model.distances import convex_bodies, separation
 from model.errors import BadInput, NoSolution
 from model.files.scene_file import Payload, StopDocument
 from model.plan import load_plan, plan_from_document, save_plan
 from model.pose import Pose, interpolate
-from model.scene import Load
+from model.scene import Load, legs_of
+from model.shapes import Sphere
 from model.statics.gravity import working_tensions
 from planner.check import check_path, verify
 from planner.planning import make_plan
@@ -63,7 +65,8 @@ def test_figures_of_a_plan_are_those_of_its_legs_with_their_loads(gachon, ready_
     plan = plan_from_document(document)
     bounds = [0, *plan.stops, len(plan.waypoints) - 1]
     lows, highs, length = [], [], 0.0
-    for (first, last), mass in zip(pairwise(bounds), [0.0, 1.2, 1.2, 0.0, 0.5, 0.0], strict=True):
+    masses = [0.0, 1.2, 1.2, 0.0, 0.5, 0.5, 0.0]
+    for (first, last), mass in zip(pairwise(bounds), masses, strict=True):
         hanging = Load(mass, np.array([0.0, 0.0, -0.08]), np.zeros(3), np.zeros(3))
         for a, b in pairwise(plan.waypoints[first : last + 1]):
             length += a.distance_to(b)
@@ -74,6 +77,22 @@ def test_figures_of_a_plan_are_those_of_its_legs_with_their_loads(gachon, ready_
     assert document.quality.length_mm == pytest.approx(length * 1000.0, rel=1e-6)
     assert document.quality.min_tension_n == pytest.approx(min(lows), abs=0.1)
     assert document.quality.max_tension_n == pytest.approx(max(highs), abs=0.1)
+
+
+def test_the_parts_of_the_ready_scene_are_carried_over_the_wall(gachon, ready_scene) -> None:
+    """Only box and cables are kept away, so its stops must be high enough for the parts."""
+    scene = ready_scene("pick_and_place")
+    plan = plan_from_document(make_plan(gachon, scene, OPTIMAL))
+    [wall] = convex_bodies(scene.obstacles[0].shape, scene.obstacles[0].pose)
+    bounds = [0, *plan.stops, len(plan.waypoints) - 1]
+    for leg, (first, last) in zip(legs_of(scene), pairwise(bounds), strict=True):
+        if leg.scene.load.payload_mass == 0.0:
+            continue
+        for a, b in pairwise(plan.waypoints[first : last + 1]):
+            for share in np.linspace(0.0, 1.0, 40):
+                at = interpolate(a, b, share).apply(leg.scene.load.payload_centre)
+                [part] = convex_bodies(Sphere(0.02), Pose.level(at))
+                assert separation(part, wall).distance >= scene.obstacle_clearance
 
 
 def test_the_same_rounds_of_each_leg_give_the_same_path_again(gachon, ready_scene) -> None:

@@ -15,7 +15,7 @@ from tests.cli.program import call
 
 SCENE = CONFIGS / "pick_and_place.yaml"
 #: Payload of each leg, [kg].
-CARRIED = [0.0, 1.2, 1.2, 0.0, 0.5, 0.0]
+CARRIED = [0.0, 1.2, 1.2, 0.0, 0.5, 0.5, 0.0]
 
 
 @pytest.mark.slow
@@ -34,7 +34,7 @@ def test_the_ready_scene_is_planned_checked_and_run_with_the_camera(tmp_path: Pa
     folder = RunFolder.open(run)
     cycles, summary, rig = folder.cycles(), folder.summary(), load_rig(rig_file)
     assert summary["verdict"] == "PASSED"
-    assert list(dict.fromkeys(cycles.leg.tolist())) == [1, 2, 3, 4, 5, 6]
+    assert list(dict.fromkeys(cycles.leg.tolist())) == [1, 2, 3, 4, 5, 6, 7]
     scene = load_plan(plan).scene
     for stop, times in zip(scene.stops, summary["stops"], strict=True):
         assert times["name"] == stop.name
