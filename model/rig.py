@@ -20,7 +20,7 @@ from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, floats_of, read_only
 from model.posed_rig import PosedRig, posed_rig
 from model.progress import SILENT, Listener
-from model.scene import Load, Scene
+from model.scene import Load, Scene, require_unaltered
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -143,6 +143,10 @@ class Rig(ReadOnly):
         """The keys and values of its file, in new lists, as for `from_dict`."""
         return self.document.model_dump(mode="json", exclude_none=True)
 
+    def remade(self) -> Rig:
+        """The rig that its document describes."""
+        return rig_from_document(self.document)
+
     @property
     def name(self) -> str:
         """Name in the rig file."""
@@ -253,7 +257,9 @@ class Rig(ReadOnly):
 
         Raises:
             InvalidFile: One is not text, or cannot be in a rig file.
+            BadInput: This rig is an altered copy (`model.scene.require_unaltered`).
         """
+        require_unaltered(self)
         named = {"interface": interface, "channel": channel}
         given = {key: value for key, value in named.items() if value is not None}
         bus = document_of(dict(self.document.bus) | given, BusDocument, "Rig.with_bus")
@@ -268,8 +274,10 @@ class Rig(ReadOnly):
                 each result that is not good enough.
 
         Raises:
-            BadInput: A result does not fit this rig, or two calibrate the same thing.
+            BadInput: A result does not fit this rig, two calibrate the same thing, or this rig is
+                an altered copy (`model.scene.require_unaltered`).
         """
+        require_unaltered(self)
         require_types(*((one, CalibrationResult) for one in results), (listener, Listener))
         return rig_from_document(corrected(self.document, results, listener))
 
