@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
@@ -56,7 +57,7 @@ def jog(
     rig: Rig,
     scene: Scene | None,
     *,
-    by: Array | None = None,
+    by: ArrayLike | None = None,
     to_home: bool = False,
     speed: float = SPEED,
     folder: Path | str | None = None,

@@ -173,13 +173,29 @@ class Rig(ReadOnly):
 
     def tensions_by(self, torques: ArrayLike) -> Array:
         """Cable tensions at rest, shape (..., m), [N], from torques [per mille of rated torque]."""
-        tensions: Array = floats_of(torques) / 1000.0 * self._rated_tensions
+        tensions: Array = self._of_cables("torques", torques) / 1000.0 * self._rated_tensions
         return tensions
 
     def torques_by(self, tensions: ArrayLike) -> Array:
         """The inverse of `tensions_by`: torques, shape (..., m), [per mille of rated torque]."""
-        torques: Array = floats_of(tensions) * 1000.0 / self._rated_tensions
+        torques: Array = self._of_cables("tensions", tensions) * 1000.0 / self._rated_tensions
         return torques
+
+    def _of_cables(self, name: str, given: ArrayLike) -> Array:
+        """An argument as an array, shape (..., m).
+
+        Raises:
+            BadInput: It is something else.
+        """
+        try:
+            values = floats_of(given)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape[-1:] != (self.cable_count,):
+            raise BadInput(
+                f"{name} must be a number for each of {self.cable_count} cables; it is {given!r}"
+            )
+        return values
 
     @cached_property
     def _rated_tensions(self) -> Array:

@@ -654,6 +654,27 @@ def test_a_wrong_argument_is_named_with_its_value(
             call()  # type: ignore[no-untyped-call]
 
 
+def test_methods_refuse_arguments_of_another_type(rig: cdpr.Rig) -> None:
+    image, tracker = np.zeros((720, 1280), np.uint8), cdpr.Tracker(rig, rig.camera())
+    for call, text in (
+        (lambda: rig.home.distance_to([0, 0, 0]), "expected a Pose, not list"),
+        (lambda: rig.home.angle_to(np.eye(3)), "expected a Pose, not ndarray"),
+        (lambda: rig.home.compose(3), "expected a Pose, not int"),
+        (lambda: rig.tensions_by([1, 2]), "torques must be a number for each of 8 cables"),
+        (lambda: rig.torques_by("x"), "tensions must be a number for each of 8 cables"),
+        (lambda: rig.torques_by(["1"] * 8), "tensions must be a number for each of 8 cables"),
+        (lambda: cdpr.Pose.level(["1", "2", "3"]), "does not consist of numbers"),
+        (lambda: cdpr.Pose.level(np.array(["1", "2", "3"])), "does not consist of numbers"),
+        (lambda: cdpr.Pose.level([1.0 + 1.0j, 0.0, 0.0]), "does not consist of numbers"),
+        (lambda: cdpr.Pose.level(np.zeros(3, complex)), "does not consist of numbers"),
+        (lambda: tracker.observe(image, math.nan), "time must be a finite number [s]"),
+        (lambda: tracker.observe(image, math.inf), "time must be a finite number [s]"),
+    ):
+        with pytest.raises(cdpr.BadInput, match=re.escape(text)):
+            call()  # type: ignore[no-untyped-call]
+    np.testing.assert_allclose(rig.tensions_by(rig.torques_by(np.full((2, 8), 10.0))), 10.0)
+
+
 def test_poses_to_pass_come_from_any_iterable(rig: cdpr.Rig, scene: cdpr.Scene) -> None:
     """The poses of an iterator had been left out without a word."""
     between = np.add(scene.start.position, [(0.0, 0.0, 0.01), (0.01, 0.0, 0.02)])
