@@ -81,6 +81,7 @@ from model.kinematics import NoCable
 from model.pose import Pose, point_of, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
+from model.scene import require_unaltered
 
 CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
 ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
@@ -209,6 +210,7 @@ def locate_camera(
         BadInput: There are no tags, or too few images that show them.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(survey, Survey)])
+    require_unaltered(rig)
     wanted = positive_number("wanted", wanted, "m")
     taken_by = rig.camera(camera)
     require_file_name(taken_by.name, "cameras")
@@ -265,6 +267,7 @@ def locate_tags(
         BadInput: There are no tags, or too few images that show them.
     """
     require_types((rig, Rig), (listener, Listener))
+    require_unaltered(rig)
     wanted = positive_number("wanted", wanted, "m")
     taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
@@ -310,6 +313,7 @@ def measure_readout(
             90°.
     """
     require_types((rig, Rig), (camera, Camera), (listener, Listener))
+    require_unaltered(rig)
     wanted = positive_number("wanted", wanted, "m")
     rate = None if rate is None else positive_number("rate", rate, "Hz")
     speed = rig.motion.speed if speed is None else positive_number("speed", speed, "m/s")
@@ -374,6 +378,7 @@ def calibrate_rig(
         BadInput: The data cannot be read, are too few, or do not fit the rig file.
     """
     require_types((rig, Rig), (listener, Listener))
+    require_unaltered(rig)
     wanted = positive_number("wanted", wanted, "m")
     deviations = checked_deviations(deviations)
     length_deviation = positive_number("length_deviation", length_deviation, "m")

@@ -16,11 +16,11 @@ from calibration.intrinsics.result import CameraResult
 from calibration.results import ResultDocument
 from calibration.statistics import Interval
 from calibration.tag_map.result import TagsResult
-from model.cameras import left_out_errors
+from model.cameras import in_order, left_out_errors
 from model.errors import BadInput
 from model.files.documents import load_yaml, read_yaml, write_atomic
 from model.progress import SILENT, Listener
-from model.rig import Rig, in_order
+from model.rig import Rig
 
 KINDS: dict[str, type[ResultDocument]] = {
     "camera": CameraResult,

@@ -315,6 +315,16 @@ class Calibration(Generic[Result, Found, Quality]):
         """Date, ISO 8601."""
         return self.result.date
 
+    @property
+    def verdict(self) -> str:
+        """What it is good for, in a sentence."""
+        return self.result.verdict
+
+    @property
+    def good_enough(self) -> bool:
+        """Whether its verdict is good."""
+        return self.result.good_enough
+
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with this result applied.
 
@@ -325,7 +335,7 @@ class Calibration(Generic[Result, Found, Quality]):
 
     def __repr__(self) -> str:
         """Kind, name, date and verdict."""
-        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.result.verdict}>"
+        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.verdict}>"
 
     def _repr_html_(self) -> str:
         """Table of results for notebooks."""

@@ -6,9 +6,15 @@ newtons, angles in radians. Every name is loaded at first use.
 
 from __future__ import annotations
 
+import sys
 from typing import TYPE_CHECKING
 
-from model.lazy import lazy_names
+try:
+    from model.lazy import lazy_names
+except ModuleNotFoundError as error:  # `lazy_names` reports those that hide other packages
+    if (found := getattr(sys.modules.get("model"), "__file__", None)) is None:
+        raise
+    raise ImportError(f"{found} hides the package `model` of cdpr: rename it") from error
 
 if TYPE_CHECKING:
     from calibration.geometry.pose_selection import measurement_poses

@@ -16,7 +16,7 @@ from model.files.reading import is_folder
 from model.plan import Plan
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Scene
+from model.scene import Scene, require_unaltered
 from planner.settings import whole_number
 
 
@@ -78,6 +78,7 @@ def track(
         BadInput: A source cannot be used, or an image has another size.
     """
     require_types((rig, Rig), (listener, Listener), optional=((scene, Scene), (plan, Plan)))
+    require_unaltered(rig, scene, plan)
     require_functions(stopped=stopped, keep=keep)
     if pictures is not None:
         pictures = whole_number("pictures", pictures, least=1)

@@ -27,7 +27,7 @@ from model.plan import Plan, plan_from_document, require_same_rig
 from model.pose import Array, Pose, point_of
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Scene
+from model.scene import Scene, require_unaltered
 from planner.check import verify
 from planner.check_report import CheckReport
 from planner.planning import plan_path
@@ -103,6 +103,7 @@ def plan(
     """
     via = sequence_of("via", via)
     require_types((rig, Rig), (scene, Scene), (listener, Listener))
+    require_unaltered(rig, scene)
     require_types(*((pose, Pose) for pose in via), optional=((start, Pose), (goal, Pose)))
     if from_run is not None and start is not None:
         raise BadInput("from_run and start contradict each other", next_step="leave out one")
@@ -192,6 +193,7 @@ def workspace_map(
             many points.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
+    require_unaltered(rig, scene)
     planes = [_plane(one) for one in sequence_of("slices", slices)]
     step = None if step is None else real_number("step", step, "m")
     volume = None if volume is None else truth_value("volume", volume)

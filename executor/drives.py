@@ -37,7 +37,7 @@ from model.kinematics import cable_lengths
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
-from model.scene import Load, empty_scene
+from model.scene import Load, empty_scene, require_unaltered
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 
@@ -67,7 +67,7 @@ def require_other_process(rig: Rig) -> None:
     """Requires a bus whose drives outlive this process.
 
     Raises:
-        BadInput: The interface is ``virtual``.
+        BadInput: The interface is ``virtual``, or the rig is an altered copy.
     """
     if is_simulated(rig):
         raise BadInput(
@@ -76,6 +76,7 @@ def require_other_process(rig: Rig) -> None:
             why="its drives are simulated inside a run and end with it",
             next_step="name the bus: --interface and --channel, in Python rig.with_bus()",
         )
+    require_unaltered(rig)
 
 
 def require_own_time(rig: Rig, realtime: bool) -> None:

@@ -42,6 +42,7 @@ from model.pages.page import FactsDisplay
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
+from model.scene import require_unaltered
 from model.statics.gravity import working_tensions
 from model.winches import whole_lengths
 from planner.settings import whole_number
@@ -138,6 +139,7 @@ def home(
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(pose, Pose)])
+    require_unaltered(rig)
     require_functions(confirm=confirm)
     at_home, realtime = truth_value("at_home", at_home), truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
@@ -39,7 +40,7 @@ from model.plan import plan_from_document
 from model.pose import Array, Pose, largest_rotations, point_of
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
-from model.scene import Scene, empty_scene, scene_from_document
+from model.scene import Scene, empty_scene, require_unaltered, scene_from_document
 from planner.kernels.jit import KERNELS
 from planner.planning import make_plan
 from planner.settings import OptimalSettings, TurningSettings, whole_number
@@ -56,7 +57,7 @@ def jog(
     rig: Rig,
     scene: Scene | None,
     *,
-    by: Array | None = None,
+    by: ArrayLike | None = None,
     to_home: bool = False,
     speed: float = SPEED,
     folder: Path | str | None = None,
@@ -90,6 +91,7 @@ def jog(
         CdprError: As for `executor.runner.run`; or the straight path is too long or not free.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(scene, Scene)])
+    require_unaltered(rig, scene)
     require_functions(confirm=confirm, on_event=on_event)
     to_home = truth_value("to_home", to_home)
     realtime = truth_value("realtime", realtime)
@@ -318,6 +320,7 @@ def jog_cable(
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     require_types((rig, Rig), (listener, Listener))
+    require_unaltered(rig)
     require_functions(confirm=confirm)
     realtime = truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)

@@ -40,7 +40,7 @@ class RunResult:
     """Result of a run; its tables are read from its folder on first access.
 
     Attributes:
-        folder: Run folder.
+        folder: Run folder, as an absolute path.
         summary: The content of ``summary.json``.
         missing: Files of the folder that could not be written, and why.
         report: The page about the run; None where it could not be made.
@@ -50,6 +50,19 @@ class RunResult:
     summary: dict[str, Any]
     missing: Mapping[str, str] = field(default_factory=dict)
     report: Path | None = None
+    _given: Path = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Makes the paths independent of the current folder."""
+        object.__setattr__(self, "_given", self.folder)
+        object.__setattr__(self, "folder", self.folder.absolute())
+        if self.report is not None:
+            object.__setattr__(self, "report", self.report.absolute())
+
+    @property
+    def shown_folder(self) -> Path:
+        """The folder in messages: as it was given, while that path leads to it."""
+        return self._given if self._given.absolute() == self.folder else self.folder
 
     @property
     def verdict(self) -> str:
@@ -99,13 +112,15 @@ class RunResult:
         """Message on files that could not be written; empty if all were."""
         if not self.missing:
             return ""
-        lines = [f"{self.folder}: some files of the run could not be written"]
+        lines = [f"{self.shown_folder}: some files of the run could not be written"]
         for why in dict.fromkeys(self.missing.values()):
             names = [name for name, reason in self.missing.items() if reason == why]
             lines.append(f"  why: {', '.join(names)}: {why}")
         removed = "the folder was removed during the run, and its record with it"
         full = "free some disk space, then " if _FULL & {*self.missing.values()} else ""
-        again = f"{full}run `cdpr report {quote(str(self.folder))}` to write the missing files"
+        again = (
+            f"{full}run `cdpr report {quote(str(self.shown_folder))}` to write the missing files"
+        )
         cycles = self.folder / CYCLES
         if cycles.is_file() and cycles.stat().st_size > TABLE_LIMIT:
             again += " on a computer with more memory, which can read the record"
@@ -157,7 +172,7 @@ class RunResult:
 
     def __repr__(self) -> str:
         """Verdict and folder."""
-        return f"<RunResult {self.verdict} in {self.folder}: {self.sentence}>"
+        return f"<RunResult {self.verdict} in {self.shown_folder}: {self.sentence}>"
 
     def _repr_html_(self) -> str:
         """For notebooks."""
@@ -166,7 +181,7 @@ class RunResult:
         rows = [
             ("verdict", self.verdict),
             ("why", self.sentence),
-            ("folder", str(self.folder)),
+            ("folder", str(self.shown_folder)),
             ("clearance", least if self._measured else "not measured"),
         ]
         return html_table(f"Run {self.folder.name}", rows)

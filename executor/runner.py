@@ -99,8 +99,8 @@ def run(
 ) -> RunResult:
     """Checks a plan, computes its set-points, arms the drives, moves, measures and reports.
 
-    On the interface ``virtual`` drives, platform and camera are simulated in this process. Ctrl-C
-    and `cdpr stop` stop all drives together along the path; they then hold.
+    On the interface ``virtual`` drives, platform and camera are simulated in this process. `cdpr
+    stop` and, in the main thread, Ctrl-C stop all drives together along the path, which then hold.
 
     Args:
         plan: The plan.
@@ -416,7 +416,8 @@ def _conclude(job: _Job, moved: _MotionData) -> RunResult:
     if moved.callbacks.error not in " ".join((course.cause, *course.troubles)):
         moved.listener.warning(f"{moved.callbacks.error}; the verdict does not depend on it")
     has_report = evaluated is not None and REPORT not in missing
-    return replace(result, missing=missing, report=job.folder.report if has_report else None)
+    report = job.folder.report if has_report else None
+    return RunResult(job.folder.path, summary, missing, report)
 
 
 def _course(moved: _MotionData, outcome: Outcome) -> RunCourse:

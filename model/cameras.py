@@ -1,15 +1,18 @@
-"""Cameras and tags of a rig, with the uncertainty of their calibration."""
+"""Cameras and tags of a rig, and calibration results that replace numbers of its file."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument, Gamma, TagDocument
+from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, ReadOnly, read_only
+from model.progress import Listener
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,22 +136,6 @@ def camera_from(document: CameraDocument) -> Camera:
     )
 
 
-def left_out_errors(before: Sequence[CameraDocument], after: Sequence[CameraDocument]) -> list[str]:
-    """Remarks on operators' errors that a new lens left out: they were stated for another one.
-
-    Args:
-        before: The cameras with their former lenses.
-        after: The same cameras in the same order.
-    """
-    return [
-        f"error_mm of camera {own.name!r}, {own.error_mm:g}, was stated for another lens and is"
-        " left out; unless calibrations state all errors, state it again in a rig file with the new"
-        " lens"
-        for own, new in zip(before, after, strict=True)
-        if own.error_mm is not None and new.error_mm is None
-    ]
-
-
 _SCALES = np.array([1e-3] * 3 + [np.pi / 180.0] * 3)
 
 
@@ -187,3 +174,106 @@ def principal_point_doubt(camera: CameraDocument) -> str:
 
 def _scaled(rows: list[list[float]] | None, scales: Array) -> Array | None:
     return None if rows is None else read_only(np.array(rows) * scales)
+
+
+# Calibration results, applied to a rig file.
+
+
+@runtime_checkable
+class CalibrationResult(Protocol):
+    """A result of `calibration`, as `Rig.with_calibration` accepts it."""
+
+    @property
+    def order(self) -> int:
+        """Results of lower order are applied first: those of higher order depend on them."""
+        ...
+
+    @property
+    def kind(self) -> str:
+        """What was calibrated, such as ``camera``."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """Which of its kind, such as the camera's name."""
+        ...
+
+    @property
+    def follows(self) -> str:
+        """Name of the result of its kind that is applied before, if given; empty for none."""
+        ...
+
+    @property
+    def date(self) -> str:
+        """Date of the calibration, ISO 8601."""
+        ...
+
+    @property
+    def verdict(self) -> str:
+        """What it is good for, in a sentence."""
+        ...
+
+    @property
+    def good_enough(self) -> bool:
+        """Whether its verdict is good."""
+        ...
+
+    def corrected(self, rig: RigDocument) -> RigDocument:
+        """The rig file's content with this result applied."""
+
+
+Result = TypeVar("Result", bound=CalibrationResult)
+
+
+def in_order(results: Iterable[Result]) -> list[Result]:
+    """Calibration results in the order in which they are applied."""
+    waiting = sorted(results, key=lambda one: one.order)
+    ordered = []
+    while waiting:
+        left = {(one.kind, one.name) for one in waiting}
+        free = (k for k, one in enumerate(waiting) if (one.kind, one.follows) not in left)
+        ordered.append(waiting.pop(next(free, 0)))  # in a circle, one is refused by its basis
+    return ordered
+
+
+def corrected(
+    document: RigDocument, results: Sequence[CalibrationResult], listener: Listener
+) -> RigDocument:
+    """A rig file's content with results applied; as `Rig.with_calibration`."""
+    seen: dict[tuple[str, str], str] = {}
+    for result in results:
+        what = (result.kind, result.name)
+        if what in seen:
+            raise BadInput(
+                f"two results of kind {result.kind} for {result.name!r}:"
+                f" {seen[what]} and {result.date}",
+                where="--calibration",
+                next_step="pass only the current one",
+            )
+        seen[what] = result.date
+    better = document
+    for result in in_order(results):
+        better = result.corrected(better)
+    for remark in left_out_errors(document.cameras, better.cameras):
+        listener.remark(remark)
+    for result in results:
+        if not result.good_enough:
+            text = f"{result.kind} {result.name}, {result.date}: {result.verdict}"
+            listener.remark(f"calibration {text}")
+    return better
+
+
+def left_out_errors(before: Sequence[CameraDocument], after: Sequence[CameraDocument]) -> list[str]:
+    """Remarks on operators' errors that a new lens left out: they were stated for another one.
+
+    Args:
+        before: The cameras with their former lenses.
+        after: The same cameras in the same order.
+    """
+    return [
+        f"error_mm of camera {own.name!r}, {own.error_mm:g}, was stated for another lens and is"
+        " left out; unless calibrations state all errors, state it again in a rig file with the new"
+        " lens"
+        for own, new in zip(before, after, strict=True)
+        if own.error_mm is not None and new.error_mm is None
+    ]

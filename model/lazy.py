@@ -5,7 +5,11 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
+from types import ModuleType
 from typing import Any
+
+_ROOT = Path(__file__).parents[1]
 
 
 def lazy_names(
@@ -18,14 +22,17 @@ def lazy_names(
 
     Args:
         package: Its ``__name__``.
-        origins: Public names of each module, separated by spaces.
+        origins: Public names of each module, separated by spaces. Those modules that are in the
+            package can be loaded by name, too.
     """
     module_of = {name: module for module, names in origins.items() for name in names.split()}
 
     def load(name: str) -> Any:
+        if f"{package}.{name}" in origins:
+            return _imported(f"{package}.{name}")
         if name not in module_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(import_module(module_of[name]), name)
+        value = getattr(_imported(module_of[name]), name)
         setattr(sys.modules[package], name, value)  # the next use finds it without this function
         return value
 
@@ -33,3 +40,23 @@ def lazy_names(
         return sorted({*vars(sys.modules[package]), *module_of})
 
     return load, listed
+
+
+def _imported(module: str) -> ModuleType:
+    """A module of this project.
+
+    Raises:
+        ImportError: A file or folder of the user hides one of our packages.
+    """
+    try:
+        return import_module(module)
+    except ImportError as error:
+        package = str(error.name).partition(".")[0]
+        found = sys.modules.get(package)
+        places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
+        theirs = [path for path in places if path and not Path(path).is_relative_to(_ROOT)]
+        if not (_ROOT / package / "__init__.py").is_file() or not theirs:
+            raise
+        raise ImportError(
+            f"{theirs[0]} hides the package `{package}` of cdpr: rename it", path=theirs[0]
+        ) from error

@@ -25,7 +25,7 @@ from model.files.validation import problems_of
 from model.pages.page import html_table
 from model.pose import Pose, largest_rotations
 from model.rig import NOT_IN_PLAN_HASH, Rig, rig_from_document
-from model.scene import Scene, scene_from_document
+from model.scene import Scene, require_unaltered, scene_from_document
 from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
@@ -56,6 +56,10 @@ class Plan:
     stops: tuple[int, ...]
     raw_path: tuple[Pose, ...]
 
+    def remade(self) -> Plan:
+        """The plan that its document describes."""
+        return plan_from_document(self.document)
+
     @property
     def length(self) -> float:
         """Length of the path of the platform's origin, [m]."""
@@ -70,8 +74,10 @@ class Plan:
         """Writes the plan file atomically; returns its path.
 
         Raises:
-            BadInput: The folder cannot be written to.
+            BadInput: The folder cannot be written to, or this plan is an altered copy
+                (`model.scene.require_unaltered`).
         """
+        require_unaltered(self)
         path = path_of(path)
         save_plan(self.document, path)
         return path
@@ -197,8 +203,9 @@ def require_same_rig(plan: Plan, rig: Rig, plan_path: Path | str) -> None:
     """Rejects a plan that was made for another rig, and names what differs.
 
     Raises:
-        BadInput: The rig's plan hash is not the plan's.
+        BadInput: The rig's plan hash is not the plan's, or one of them is an altered copy.
     """
+    require_unaltered(plan, rig)
     if plan.rig.plan_hash == rig.plan_hash:
         return
     ours = rig.document.model_dump(mode="json")

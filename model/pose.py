@@ -17,7 +17,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from model.errors import BadInput, distinct_figures
+from model.errors import BadInput, distinct_figures, require_types
 
 Array = NDArray[np.float64]
 
@@ -27,26 +27,33 @@ def floats_of(values: ArrayLike) -> Array:
 
     Raises:
         BadInput: It has masked values; NumPy would use the numbers behind the mask.
+        TypeError: It has texts or complex numbers, which NumPy would convert.
     """
-    require_unmasked(values)
+    require_real(values)
     return np.asarray(values, dtype=np.float64)
 
 
-def require_unmasked(values: object) -> None:
-    """Requires an array, or a list of arrays, without masked values; errors as for `floats_of`."""
+def require_real(values: object) -> None:
+    """Requires an array, or a list of arrays, of real numbers; errors as for `floats_of`."""
     if isinstance(values, list | tuple):
         for one in values:
-            require_unmasked(one)
+            require_real(one)
     elif isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
         raise BadInput(
             "an array has masked values, which are not to be used as numbers",
             next_step="leave them out, or fill them with `numpy.ma.filled`",
         )
+    elif isinstance(values, str | bytes | complex) or _is_converted(values):
+        raise TypeError("not real numbers")
+
+
+def _is_converted(values: object) -> bool:
+    return getattr(getattr(values, "dtype", None), "kind", "") in ("U", "S", "c")
 
 
 def read_only(values: ArrayLike) -> Array:
     """A float copy of ``values`` that cannot be written to; errors as for `floats_of`."""
-    require_unmasked(values)
+    require_real(values)
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
@@ -100,17 +107,6 @@ def skew(vector: ArrayLike) -> Array:
     """Matrix of the cross product: ``skew(a) @ b == a × b``; shape (3, 3)."""
     x, y, z = np.asarray(vector, dtype=np.float64).tolist()
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
-def lever_arm_matrix(arm: Array) -> Array:
-    """Maps the error twist of a frame to that of a body in it, shape (6, 6), world axes.
-
-    Args:
-        arm: From the frame's origin to the body's, world axes, shape (3,), [m].
-    """
-    by_frame = np.eye(6)
-    by_frame[:3, 3:] = -skew(arm)
-    return by_frame
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
@@ -303,6 +299,7 @@ class Pose(ReadOnly):
 
     def compose(self, other: Pose) -> Pose:
         """``a_from_b.compose(b_from_c)`` is ``a_from_c``."""
+        require_types((other, Pose))
         return Pose(self.apply(other.position), self.rotation @ other.rotation)
 
     def inverse(self) -> Pose:
@@ -318,11 +315,13 @@ class Pose(ReadOnly):
 
     def angle_to(self, other: Pose) -> float:
         """Angle of the rotation between two poses, [rad]."""
+        require_types((other, Pose))
         relative = self.rotation.T @ other.rotation
         return float(np.linalg.norm(rotation_vector_from_matrix(relative)))
 
     def distance_to(self, other: Pose) -> float:
         """Distance of the origins, [m]."""
+        require_types((other, Pose))
         return float(np.linalg.norm(other.position - self.position))
 
 

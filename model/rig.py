@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from model.cameras import Camera, Tag, camera_from, left_out_errors, tag_from
+from model.cameras import CalibrationResult, Camera, Tag, camera_from, corrected, tag_from
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, load_yaml, millimetres
 from model.files.rig_file import BusDocument, MotionDocument, RigDocument, WinchDocument
@@ -20,20 +20,18 @@ from model.pages.page import html_table
 from model.pose import Array, Pose, ReadOnly, floats_of, read_only
 from model.posed_rig import PosedRig, posed_rig
 from model.progress import SILENT, Listener
-from model.scene import Load, Scene
+from model.scene import Load, Scene, require_unaltered
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 __all__ = [
     "NOT_IN_PLAN_HASH",
-    "CalibrationResult",
     "Camera",
     "Motion",
     "Rig",
     "Tag",
     "Winch",
-    "in_order",
     "load_rig",
     "rig_from_document",
 ]
@@ -86,39 +84,6 @@ class Motion:
     start_tolerance: float
     stuck_travel: float
     stuck_speed: float
-
-
-@runtime_checkable
-class CalibrationResult(Protocol):
-    """A result of `calibration`, as `Rig.with_calibration` accepts it."""
-
-    @property
-    def order(self) -> int:
-        """Results of lower order are applied first: those of higher order depend on them."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """What was calibrated, such as ``camera``."""
-        ...
-
-    @property
-    def name(self) -> str:
-        """Which of its kind, such as the camera's name."""
-        ...
-
-    @property
-    def follows(self) -> str:
-        """Name of the result of its kind that is applied before, if given; empty for none."""
-        ...
-
-    @property
-    def date(self) -> str:
-        """Date of the calibration, ISO 8601."""
-        ...
-
-    def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this result applied."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +143,10 @@ class Rig(ReadOnly):
         """The keys and values of its file, in new lists, as for `from_dict`."""
         return self.document.model_dump(mode="json", exclude_none=True)
 
+    def remade(self) -> Rig:
+        """The rig that its document describes."""
+        return rig_from_document(self.document)
+
     @property
     def name(self) -> str:
         """Name in the rig file."""
@@ -204,13 +173,29 @@ class Rig(ReadOnly):
 
     def tensions_by(self, torques: ArrayLike) -> Array:
         """Cable tensions at rest, shape (..., m), [N], from torques [per mille of rated torque]."""
-        tensions: Array = floats_of(torques) / 1000.0 * self._rated_tensions
+        tensions: Array = self._of_cables("torques", torques) / 1000.0 * self._rated_tensions
         return tensions
 
     def torques_by(self, tensions: ArrayLike) -> Array:
         """The inverse of `tensions_by`: torques, shape (..., m), [per mille of rated torque]."""
-        torques: Array = floats_of(tensions) * 1000.0 / self._rated_tensions
+        torques: Array = self._of_cables("tensions", tensions) * 1000.0 / self._rated_tensions
         return torques
+
+    def _of_cables(self, name: str, given: ArrayLike) -> Array:
+        """An argument as an array, shape (..., m).
+
+        Raises:
+            BadInput: It is something else.
+        """
+        try:
+            values = floats_of(given)
+        except (TypeError, ValueError):
+            values = np.empty(0)
+        if values.shape[-1:] != (self.cable_count,):
+            raise BadInput(
+                f"{name} must be a number for each of {self.cable_count} cables; it is {given!r}"
+            )
+        return values
 
     @cached_property
     def _rated_tensions(self) -> Array:
@@ -288,7 +273,9 @@ class Rig(ReadOnly):
 
         Raises:
             InvalidFile: One is not text, or cannot be in a rig file.
+            BadInput: This rig is an altered copy (`model.scene.require_unaltered`).
         """
+        require_unaltered(self)
         named = {"interface": interface, "channel": channel}
         given = {key: value for key, value in named.items() if value is not None}
         bus = document_of(dict(self.document.bus) | given, BusDocument, "Rig.with_bus")
@@ -299,29 +286,16 @@ class Rig(ReadOnly):
 
         Args:
             results: From calibration functions or `calibration.load_result`, in any order.
-            listener: Receives a remark for each ``error_mm`` that a new lens leaves out.
+            listener: Receives a remark for each ``error_mm`` that a new lens leaves out, and for
+                each result that is not good enough.
 
         Raises:
-            BadInput: A result does not fit this rig, or two calibrate the same thing.
+            BadInput: A result does not fit this rig, two calibrate the same thing, or this rig is
+                an altered copy (`model.scene.require_unaltered`).
         """
-        seen: dict[tuple[str, str], str] = {}
-        require_types(*((result, CalibrationResult) for result in results))
-        for result in results:
-            what = (result.kind, result.name)
-            if what in seen:
-                raise BadInput(
-                    f"two results of kind {result.kind} for {result.name!r}:"
-                    f" {seen[what]} and {result.date}",
-                    where="--calibration",
-                    next_step="pass only the current one",
-                )
-            seen[what] = result.date
-        document = self.document
-        for result in in_order(results):
-            document = result.corrected(document)
-        for remark in left_out_errors(self.document.cameras, document.cameras):
-            listener.remark(remark)
-        return rig_from_document(document)
+        require_unaltered(self)
+        require_types(*((one, CalibrationResult) for one in results), (listener, Listener))
+        return rig_from_document(corrected(self.document, results, listener))
 
     def plot(self, pose: Pose | None = None, scene: Scene | None = None) -> Figure:
         """A figure of the rig at a pose (home when left out), among a scene's obstacles."""
@@ -348,20 +322,6 @@ class Rig(ReadOnly):
             ("cameras", cameras or "none"),
         ]
         return html_table(f"Rig {self.name}", rows)
-
-
-Result = TypeVar("Result", bound=CalibrationResult)
-
-
-def in_order(results: Iterable[Result]) -> list[Result]:
-    """Calibration results in the order in which they are applied."""
-    waiting = sorted(results, key=lambda one: one.order)
-    ordered = []
-    while waiting:
-        left = {(one.kind, one.name) for one in waiting}
-        free = (k for k, one in enumerate(waiting) if (one.kind, one.follows) not in left)
-        ordered.append(waiting.pop(next(free, 0)))  # in a circle, one is refused by its basis
-    return ordered
 
 
 def load_rig(path: str | Path) -> Rig:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -157,6 +157,10 @@ class Scene(ReadOnly):
         ]
         return [*rig.document.remarks(), *self.document.remarks(), *carried]
 
+    def remade(self) -> Scene:
+        """The scene that its document describes."""
+        return scene_from_document(self.document)
+
     def stop_facts(self) -> list[tuple[str, str]]:
         """Human-readable summary of the stops and the load after each; empty without stops."""
         carried = [leg.scene.load.payload_mass for leg in legs_of(self)]
@@ -179,10 +183,11 @@ class Scene(ReadOnly):
         """The same scene with another start, goal, obstacle clearance [m], stops or payload.
 
         Raises:
-            BadInput: An argument is of another type, the clearance is negative or not finite, or
-                stops do not fit the payload.
+            BadInput: An argument is of another type, the clearance is negative or not finite, stops
+                do not fit the payload, or this scene is an altered copy (`require_unaltered`).
         """
         document = self.document
+        require_unaltered(self)
         require_types(optional=((start, Pose), (goal, Pose)))
         if clearance is not None:
             clearance = real_number("clearance", clearance, "m")
@@ -351,3 +356,62 @@ def legs_of(scene: Scene) -> tuple[Leg, ...]:
         )
         legs.append(Leg(part, begin[0], end[0]))
     return tuple(legs)
+
+
+# Rigs, scenes and plans whose fields are no longer those of their documents.
+
+
+_HOW_TO_CHANGE = {
+    "Rig": "use cdpr.Rig.from_dict({**rig.as_dict(), ...}), rig.with_bus or rig.with_calibration",
+    "Scene": "use scene.changed(...), or cdpr.Scene.from_dict({**scene.as_dict(), ...})",
+    "Plan": "make a plan of other waypoints with cdpr.plan_from_waypoints(rig, scene, waypoints)",
+}
+
+
+class Documented(Protocol):
+    """A rig, a scene or a plan."""
+
+    def remade(self) -> object:
+        """The same, from its document."""
+        ...
+
+
+def require_unaltered(*things: Documented | None) -> None:
+    """Refuses copies with other fields than their documents, as `dataclasses.replace` makes them.
+
+    Hashes, files and the process of the drives come from the document.
+
+    Args:
+        things: Rigs, scenes and plans; None for those left out.
+
+    Raises:
+        BadInput: With the first field that differs, and how to change such an object.
+    """
+    for thing in things:
+        if thing is None or (field := _differing(made := thing.remade(), thing)) is None:
+            continue
+        kind = type(made).__name__
+        raise BadInput(
+            f"the field `{field}` of a {kind} is not that of its document",
+            why="it was changed in a copy, as `dataclasses.replace` makes it; hashes, files and"
+            " the drives' process use the document",
+            next_step=_HOW_TO_CHANGE[kind],
+        )
+
+
+def _differing(made: object, given: object, name: str = "") -> str | None:
+    """Path of the first field that differs, such as ``motion.speed``; None where none does."""
+    if made is given:
+        return None
+    if isinstance(made, tuple) and isinstance(given, tuple) and len(made) == len(given):
+        parts = [(f"{name}[{k}]", *pair) for k, pair in enumerate(zip(made, given, strict=True))]
+    elif is_dataclass(made) and isinstance(given, type(made)):
+        names = [one.name for one in fields(made)]
+        parts = [(f"{name}.{n}".lstrip("."), getattr(made, n), getattr(given, n)) for n in names]
+    elif isinstance(made, np.ndarray):
+        same = isinstance(given, np.ndarray) and np.array_equal(made, given)
+        return None if same else name
+    else:
+        return None if not isinstance(given, np.ndarray) and made == given else name
+    found = (_differing(one, other, part) for part, one, other in parts)
+    return next((part for part in found if part is not None), None)

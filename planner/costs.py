@@ -87,7 +87,10 @@ class KinematicCost:
         self.rig = rig
         self._rotation = rotation
         self.lattice = Lattice.over(rig.workspace_lower, rig.workspace_upper)
-        key = [rig.plan_hash, rotation.tolist(), _version()]
+        box = self.lattice.lower, self.lattice.spacing
+        tensions = rig.min_tension, rig.max_tension
+        cables = rig.outlets, rig.anchors, rig.pulley_radius, rig.feed_directions
+        key = [*cables, *tensions, *box, rotation, _version()]
         condition, inverse = stored("cost", key, (2, self.lattice.count), self._on_lattice)
         self.extremes = [finite_range(v) for v in (condition, inverse)]
         self.values = self._scaled(condition, inverse)

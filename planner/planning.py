@@ -28,7 +28,7 @@ from model.plan import Plan, plan_from_document, sealed
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Leg, Scene, legs_of
+from model.scene import Leg, Scene, legs_of, require_unaltered
 from planner.check import check_path
 from planner.check_report import CheckReport, PlanRejected
 from planner.costs import KinematicCost
@@ -338,6 +338,7 @@ def plan_from_waypoints(
     """
     waypoints = sequence_of("waypoints", waypoints)
     require_types((rig, Rig), (scene, Scene), *((pose, Pose) for pose in waypoints))
+    require_unaltered(rig, scene)
     require_text(author=author)
     if len(waypoints) < 2:
         raise BadInput(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, Gamma
-from model.pose import Array, require_unmasked
+from model.pose import Array, require_real, skew
 from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
@@ -249,7 +249,7 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
             where=f"rig {rig}, camera {camera.name!r}",
             next_step="pass a grey image; `cv2.imread` returns None for a file it cannot read",
         )
-    require_unmasked(image)
+    require_real(image)
     wanted = (camera.height, camera.width)
     if image.shape != wanted or image.dtype != np.uint8:
         size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))
@@ -314,3 +314,14 @@ def _table(values: Array) -> NDArray[np.uint8]:
 
 def _by_table(image: Image, table: Image) -> Image:
     return np.asarray(cv2.LUT(image, table), np.uint8)
+
+
+def lever_arm_matrix(arm: Array) -> Array:
+    """Maps the error twist of a frame to that of a body in it, shape (6, 6), world axes.
+
+    Args:
+        arm: From the frame's origin to the body's, world axes, shape (3,), [m].
+    """
+    by_frame = np.eye(6)
+    by_frame[:3, 3:] = -skew(arm)
+    return by_frame

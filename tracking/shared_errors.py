@@ -16,9 +16,15 @@ from scipy.special import ndtr
 
 from model.cameras import Z_95
 from model.errors import Fault
-from model.pose import Array, Pose, lever_arm_matrix, read_only, skew
+from model.pose import Array, Pose, read_only, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import project_undistorted, ray_slopes, rays_of, undistorted_slopes
+from tracking.camera_model import (
+    lever_arm_matrix,
+    project_undistorted,
+    ray_slopes,
+    rays_of,
+    undistorted_slopes,
+)
 from tracking.clearance import missing_errors
 from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.pnp import HUBER, BundlePose, Squares, TagView, huber_weights, solve_pnp

@@ -164,13 +164,16 @@ class Tracker:
                 enter the measured pose.
 
         Raises:
-            BadInput: The image is not grey, or not of the camera's size; another type.
+            BadInput: The image is not grey, or not of the camera's size; another type; the time is
+                not finite.
             CameraMoved: In two images, the frame tags are at the same wrong positions. The first of
                 them, and all until a check passes, give no pose.
         """
         require_image_format(image, self.camera, self.rig.name)
         require_types(optional=[(by_drives, Pose)])
         time = real_number("time", time, "s")
+        if not math.isfinite(time):
+            raise BadInput(f"time must be a finite number [s], it is {time}")
         self._pictures += 1
         result: Observation | None = None
         if self._last is not None:

@@ -49,11 +49,12 @@ from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
 from model.cameras import Z_95
 from model.errors import BadInput, positive_number
-from model.pose import Array, Pose, lever_arm_matrix, matrix_from_rotation_vector, moved, read_only
+from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import (
     Image,
+    lever_arm_matrix,
     project_undistorted,
     undistort_pixels,
     undistorted_slopes,

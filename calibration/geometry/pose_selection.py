@@ -22,7 +22,7 @@ from model.plan import Plan, plan_facts, plan_from_document
 from model.pose import Array, Pose, largest_rotations, matrix_from_rotation_vector
 from model.progress import SILENT, Listener
 from model.rig import Rig
-from model.scene import Load, Scene, scene_from_document
+from model.scene import Load, Scene, require_unaltered, scene_from_document
 from model.statics.gravity import working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 from model.statics.wrench_sets import rms_anchor_radius
@@ -272,6 +272,7 @@ def measurement_poses(
         NoSolution: Too few poses are feasible and free, or there is no path between two.
     """
     require_types((rig, Rig), (scene, Scene), (listener, Listener))
+    require_unaltered(rig, scene)
     count = whole_number("count", count, least=1)
     candidates = whole_number("candidates", candidates, least=1)
     settings = TurningSettings(weights=OBJECTIVES["length"], seed=seed, rounds=ROUNDS)

@@ -67,16 +67,7 @@ def calibrated_rig(rig: Rig, files: Sequence[Path] | None) -> Rig:
     if not files:
         return rig
     results = [calibration.load_result(file) for file in files]
-    better = rig.with_calibration(*results, listener=Terminal())
-    remark_on_verdicts(results)
-    return better
-
-
-def remark_on_verdicts(results: Sequence[calibration.ResultDocument]) -> None:
-    """Remarks on each result that is used although it is not good enough."""
-    for one in results:
-        if not one.good_enough:
-            Terminal().remark(f"calibration {one.kind} {one.name}, {one.date}: {one.verdict}")
+    return rig.with_calibration(*results, listener=Terminal())
 
 
 # Verbs that reach drives: the rig, its bus, and the motion.

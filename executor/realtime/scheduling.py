@@ -10,9 +10,10 @@ import resource
 import signal
 import struct
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from multiprocessing import current_process, resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -294,9 +295,34 @@ def exit_text(process: BaseProcess) -> str:
     return f"killed by signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
 
+class _Shared:
+    """A context of the whole process that threads may enter side by side: the last one ends it."""
+
+    def __init__(self, make: Callable[[], AbstractContextManager[None]]) -> None:
+        self._make, self._lock, self._inside = make, threading.Lock(), 0
+        self._context: AbstractContextManager[None] = nullcontext()
+
+    def __call__(self) -> _Shared:
+        return self
+
+    def __enter__(self) -> None:
+        with self._lock:
+            if self._inside == 0:
+                self._context = self._make()
+                self._context.__enter__()
+            self._inside += 1
+
+    def __exit__(self, *_error: object) -> None:
+        with self._lock:
+            self._inside -= 1
+            if self._inside == 0:
+                self._context.__exit__(None, None, None)
+
+
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
+@_Shared
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Keeps libraries of processes started in the block to one thread."""
@@ -317,6 +343,7 @@ def one_thread() -> Iterator[None]:
 SWITCH_INTERVAL = 0.5e-3
 
 
+@_Shared
 @contextmanager
 def prompt_threads() -> Iterator[None]:
     """Threads of this process take turns at `SWITCH_INTERVAL` while the block runs."""

@@ -218,7 +218,7 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
     world = build_world(rig, scene, rotation, scene.obstacle_clearance + CLEARANCE_RESERVE)
     load = build_load(rig, scene, rotation)
     lattice = kinematic.lattice
-    key = [rig.plan_hash, scene.document.load.model_dump(mode="json"), rotation.tolist()]
+    key = [world.limits, world.platform, world.pulley, world.cables, *load]
     reserve = margin_reserve(rig, scene.load, turns=False)
     cells = stored("holding", [*key, reserve], _CELLS, lambda: _proved_cells(world, load, reserve))
     holding = Holding(reserve, cells, bool(cells.all()))
@@ -227,7 +227,7 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
         points = lattice.points(np.arange(lattice.count))
         capacity = stored(
             "margins",
-            key,
+            [*key, lattice.lower, lattice.spacing],
             lattice.shape,
             lambda: margins(world, load, points).reshape(lattice.shape),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -67,20 +67,21 @@ _MOST_FILES = 200
 
 
 def stored(
-    name: str, key: Any, shape: tuple[int, ...], compute: Callable[[], NDArray[Kind]]
+    name: str, key: Sequence[Any], shape: tuple[int, ...], compute: Callable[[], NDArray[Kind]]
 ) -> NDArray[Kind]:
     """An array from the user's cache, or computed and stored there.
 
     Args:
         name: Beginning of the file's name.
-        key: Everything it depends on, JSON-like.
+        key: Every value that `compute` uses: arrays, or JSON-like.
         shape: Required shape; another one is recomputed.
         compute: Computes it.
     """
     folder = cache_folder(*KERNELS)
     if folder is None:
         return compute()
-    path = folder / f"{name}-{content_hash(key).removeprefix('sha256:')[:24]}.npy"
+    parts = [part.tolist() if isinstance(part, np.ndarray) else part for part in key]
+    path = folder / f"{name}-{content_hash(parts).removeprefix('sha256:')[:24]}.npy"
     try:
         found = np.load(path, allow_pickle=False)
         if found.shape == shape:

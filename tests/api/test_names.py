@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,37 @@ def test_a_misspelt_name_is_an_ordinary_attribute_error() -> None:
 
     with pytest.raises(AttributeError, match="'cdpr' has no attribute 'plann'"):
         _ = cdpr.plann  # type: ignore[attr-defined]
+
+
+def answer_of(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
+    """Runs a script in a folder, as `python script.py` does."""
+    (folder / "script.py").write_text(code)
+    command = [sys.executable, str(folder / "script.py")]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def test_less_common_verbs_are_found_in_a_fresh_process(tmp_path: Path) -> None:
+    """`cdpr.operation` existed only after `cdpr.plan` or another name of its had been used."""
+    answer = answer_of(tmp_path, "import cdpr\nprint(cdpr.operation.hold.__name__)\n")
+    assert (answer.stdout, answer.stderr) == ("hold\n", "")
+
+
+@pytest.mark.parametrize(
+    ("file", "code"),
+    [
+        ("model.py", "import cdpr"),
+        ("planner.py", "import cdpr\ncdpr.plan_from_waypoints"),
+        ("planner/__init__.py", "import cdpr\ncdpr.plan"),
+    ],
+)
+def test_a_file_that_hides_a_package_is_named(tmp_path: Path, file: str, code: str) -> None:
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    (tmp_path / file).write_text("SPEED = 1.0\n")
+    answer = answer_of(tmp_path, code)
+    name = file.partition("/")[0].removesuffix(".py")
+    assert answer.returncode == 1
+    last = f"ImportError: {tmp_path / file} hides the package `{name}` of cdpr: rename it"
+    assert answer.stderr.splitlines()[-1] == last
 
 
 def test_every_public_name_is_documented() -> None:

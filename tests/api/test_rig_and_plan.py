@@ -124,6 +124,103 @@ def test_a_rig_or_scene_is_made_again_from_its_own_keys(name: str) -> None:
     assert kind.from_dict(in_file).hash == loaded.hash
 
 
+@pytest.fixture(scope="module")
+def bent(rig: cdpr.Rig, scene: cdpr.Scene) -> cdpr.Plan:
+    """A plan of three waypoints, made without a search."""
+    ends = np.add(scene.start.position, [(0.0, 0.0, 0.0), (0.0, 0.0, 0.01), (0.01, 0.0, 0.02)])
+    waypoints = [cdpr.Pose.level(position) for position in ends]
+    return cdpr.plan_from_waypoints(rig, scene.changed(goal=waypoints[-1]), waypoints)
+
+
+def altered_copies(rig: cdpr.Rig, scene: cdpr.Scene, bent: cdpr.Plan) -> dict[str, Any]:
+    """Copies with other values than their documents, by the field that was changed."""
+    beside = cdpr.Pose.level(np.add(bent.waypoints[1].position, (0.0, 0.0, 0.005)))
+    return {
+        "anchors": replace(rig, anchors=1.6 * rig.anchors),
+        "mass": replace(rig, mass=3.0 * rig.mass),
+        "motion.speed": replace(rig, motion=replace(rig.motion, speed=1.0)),
+        "winches[2].home_counts": replace(
+            rig,
+            winches=(*rig.winches[:2], replace(rig.winches[2], home_counts=7), *rig.winches[3:]),
+        ),
+        "obstacle_clearance": replace(scene, obstacle_clearance=0.05),
+        "obstacles": replace(scene, obstacles=()),
+        "goal.position": replace(scene, goal=scene.start),
+        "waypoints[1].position": replace(
+            bent, waypoints=(bent.waypoints[0], beside, *bent.waypoints[2:])
+        ),
+        "stops": replace(bent, stops=(1,)),
+        "rig.mass": replace(bent, rig=replace(rig, mass=3.0 * rig.mass)),
+    }
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        *("anchors", "mass", "motion.speed", "winches[2].home_counts", "obstacle_clearance"),
+        *("obstacles", "goal.position", "waypoints[1].position", "stops", "rig.mass"),
+    ],
+)
+def test_a_copy_with_other_values_is_refused_with_how_to_make_one(
+    rig: cdpr.Rig, scene: cdpr.Scene, bent: cdpr.Plan, field: str, tmp_path: Path
+) -> None:
+    """It had passed the check, and another path was saved, or another rig moved."""
+    other, refused = altered_copies(rig, scene, bent)[field], tmp_path / "refused"
+    ends = [scene.start, scene.goal]
+    calls: list[Callable[[], object]]
+    if isinstance(other, cdpr.Rig):
+        calls = [
+            lambda: cdpr.plan(other, scene, rounds=1),
+            lambda: cdpr.plan_from_waypoints(other, scene, ends),
+            lambda: cdpr.check(bent, other),
+            lambda: cdpr.run(bent, other, folder=refused, cameras=[], realtime=False),
+            lambda: cdpr.home(other, at_home=True, realtime=False),
+            lambda: cdpr.jog(other, None, to_home=True, realtime=False),
+            lambda: jog_cable(other, 1, 0.001, realtime=False),
+            lambda: cdpr.workspace_map(other, workers=1),
+            lambda: cdpr.measurement_poses(other, scene),
+            lambda: cdpr.track(other, "absent"),
+            lambda: cdpr.calibrate_rig(other, "absent"),
+            lambda: cdpr.locate_camera(other, "absent"),
+            lambda: cdpr.locate_tags(other, "absent"),
+            lambda: other.with_bus("virtual", "other"),
+            lambda: other.with_calibration(),
+        ]
+        step = "cdpr.Rig.from_dict({**rig.as_dict(), ...}), rig.with_bus or rig.with_calibration"
+    elif isinstance(other, cdpr.Scene):
+        calls = [
+            lambda: cdpr.plan(rig, other, rounds=1),
+            lambda: cdpr.plan_from_waypoints(rig, other, ends),
+            lambda: cdpr.jog(rig, other, to_home=True, realtime=False),
+            lambda: cdpr.workspace_map(rig, other, workers=1),
+            lambda: cdpr.measurement_poses(rig, other),
+            other.changed,
+        ]
+        step = "scene.changed(...), or cdpr.Scene.from_dict({**scene.as_dict(), ...})"
+    else:
+        calls = [
+            lambda: cdpr.check(other),
+            lambda: cdpr.run(other, rig, folder=refused, cameras=[], realtime=False),
+            lambda: other.save(refused),
+        ]
+        step = "cdpr.plan_from_waypoints"
+    for call in calls:
+        kind = type(other).__name__
+        with pytest.raises(cdpr.BadInput, match=re.escape(f"`{field}` of a {kind} is")) as caught:
+            call()
+        assert step in caught.value.next_step
+    assert not refused.exists()
+
+
+def test_a_copy_with_the_same_values_is_used(
+    rig: cdpr.Rig, scene: cdpr.Scene, bent: cdpr.Plan
+) -> None:
+    same = replace(rig, anchors=rig.anchors.copy(), document=rig.document.model_copy(deep=True))
+    assert cdpr.check(replace(bent, rig=same), same).passed
+    assert same.with_bus().plan_hash == rig.plan_hash
+    assert pickle.loads(pickle.dumps(scene)).changed().hash == scene.hash
+
+
 def test_a_rig_is_varied_in_memory_and_checked_like_a_file(rig: cdpr.Rig) -> None:
     data = rig.as_dict()
     wider = np.array(data["outlets_mm"]) * [1.1, 1.1, 1.0]
@@ -555,6 +652,27 @@ def test_a_wrong_argument_is_named_with_its_value(
     ):
         with pytest.raises(cdpr.BadInput, match=re.escape(text)):
             call()  # type: ignore[no-untyped-call]
+
+
+def test_methods_refuse_arguments_of_another_type(rig: cdpr.Rig) -> None:
+    image, tracker = np.zeros((720, 1280), np.uint8), cdpr.Tracker(rig, rig.camera())
+    for call, text in (
+        (lambda: rig.home.distance_to([0, 0, 0]), "expected a Pose, not list"),
+        (lambda: rig.home.angle_to(np.eye(3)), "expected a Pose, not ndarray"),
+        (lambda: rig.home.compose(3), "expected a Pose, not int"),
+        (lambda: rig.tensions_by([1, 2]), "torques must be a number for each of 8 cables"),
+        (lambda: rig.torques_by("x"), "tensions must be a number for each of 8 cables"),
+        (lambda: rig.torques_by(["1"] * 8), "tensions must be a number for each of 8 cables"),
+        (lambda: cdpr.Pose.level(["1", "2", "3"]), "does not consist of numbers"),
+        (lambda: cdpr.Pose.level(np.array(["1", "2", "3"])), "does not consist of numbers"),
+        (lambda: cdpr.Pose.level([1.0 + 1.0j, 0.0, 0.0]), "does not consist of numbers"),
+        (lambda: cdpr.Pose.level(np.zeros(3, complex)), "does not consist of numbers"),
+        (lambda: tracker.observe(image, math.nan), "time must be a finite number [s]"),
+        (lambda: tracker.observe(image, math.inf), "time must be a finite number [s]"),
+    ):
+        with pytest.raises(cdpr.BadInput, match=re.escape(text)):
+            call()  # type: ignore[no-untyped-call]
+    np.testing.assert_allclose(rig.tensions_by(rig.torques_by(np.full((2, 8), 10.0))), 10.0)
 
 
 def test_poses_to_pass_come_from_any_iterable(rig: cdpr.Rig, scene: cdpr.Scene) -> None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import os
 import re
 import shutil
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from html import escape
 from pathlib import Path
@@ -271,6 +274,30 @@ def test_a_figure_shows_error_tensions_and_clearance(run: cdpr.RunResult) -> Non
 def test_without_a_run_under_way_a_stop_reaches_nothing() -> None:
     with pytest.raises(cdpr.Fault):
         cdpr.stop()
+
+
+def test_a_stop_ends_a_run_in_a_worker_thread(tmp_path: Path) -> None:
+    """Where Ctrl-C, which Python raises in the main thread alone, does not reach it."""
+    rig, scene = ready()
+    goal = short_goal(scene)
+    plan = cdpr.plan_from_waypoints(rig, scene.changed(goal=goal), [scene.start, goal])
+    moving, stopped = threading.Event(), threading.Event()
+
+    def wait_for_stop(event: RunEvent) -> None:
+        if event.code == "moving":
+            moving.set()
+            assert stopped.wait(60.0)
+
+    with ThreadPoolExecutor(1) as pool:
+        folder, options = tmp_path / "run", {"cameras": [], "on_event": wait_for_stop}
+        future = pool.submit(cdpr.run, plan, rig, folder=folder, realtime=False, **options)
+        try:
+            assert moving.wait(60.0)
+            assert cdpr.stop() == [os.getpid()]
+        finally:
+            stopped.set()
+        run = future.result()
+    assert (run.verdict, run.exit_code) == ("STOPPED", 130)
 
 
 #: Parts of files of a record that are replaced by others.

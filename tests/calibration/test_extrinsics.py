@@ -23,7 +23,7 @@ from calibration.tag_map.observations import TagObservations, observe_tags
 from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
-from model.rig import Rig, Tag, load_rig
+from model.rig import Rig, Tag, load_rig, rig_from_document
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
 from tests.calibration.exact_sights import observe
@@ -301,7 +301,7 @@ def test_a_result_is_refused_where_what_it_rests_on_was_changed(rig: Rig, pictur
     )
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     other = rig.document.cameras[0].model_copy(update={"fx_px": 901.0})
-    changed = replace(rig, document=rig.document.model_copy(update={"cameras": [other]}))
+    changed = rig_from_document(rig.document.model_copy(update={"cameras": [other]}))
     with pytest.raises(BadInput, match="was made with parameters of the camera or frame tags"):
         changed.with_calibration(result)
 
@@ -313,7 +313,7 @@ def test_a_result_for_a_camera_at_rest_outlives_a_latency_stated_later(rig: Rig,
     )
     result = extrinsics_result(found, judge_extrinsics(found, 1e-3), rig.document, date(2026, 3, 2))
     known = rig.document.cameras[0].model_copy(update={"latency_ms": 40.0})
-    changed = replace(rig, document=rig.document.model_copy(update={"cameras": [known]}))
+    changed = rig_from_document(rig.document.model_copy(update={"cameras": [known]}))
     pose = changed.with_calibration(result).cameras[0].world_from_camera
     assert pose.distance_to(found.world_from_camera) < 1e-8
 

@@ -17,7 +17,7 @@ from calibration.extrinsics.result import (
     workspace_corners,
 )
 from calibration.result_files import load_result
-from calibration.results import CalibrationVerdict, Issue, write_result
+from calibration.results import Calibration, CalibrationVerdict, Issue, write_result
 from calibration.statistics import Interval
 from model.errors import BadInput
 from model.rig import Rig, load_rig, rig_from_document
@@ -104,6 +104,17 @@ def test_an_error_stated_for_another_lens_is_left_out(rig: Rig) -> None:
         same = known.with_calibration(camera_result_of(), listener=remarks)
         assert same.document.cameras[0].error_mm == known.document.cameras[0].error_mm
     assert remarks.texts == []
+
+
+def test_a_result_that_is_not_good_enough_is_used_with_a_remark(rig: Rig) -> None:
+    poor = {"good_enough": False, "verdict": "not good enough: few images"}
+    result, remarks = camera_result_of().model_copy(update=poor), Remarks([])
+    made = Calibration(result, page="", found=None, quality=None)
+    for one in (result, made):
+        assert rig.with_calibration(one, listener=remarks).cameras[0].matrix[0, 0] == 905.0
+    rig.with_calibration(camera_result_of(), listener=remarks)
+    text = f"calibration camera front, {result.date}: not good enough: few images"
+    assert [one for one in remarks.texts if "error_mm" not in one] == [text, text]
 
 
 @pytest.mark.parametrize(

@@ -24,7 +24,7 @@ from calibration.tag_map.observations import TagObservations, TagViews, moved_ta
 from calibration.tag_map.result import judge_layout, tags_result
 from model.errors import BadInput
 from model.pose import Pose
-from model.rig import Rig, Tag, load_rig
+from model.rig import Rig, Tag, load_rig, rig_from_document
 from tests.calibration.exact_sights import observe
 from tracking.detection.tags import tag_corners
 from tracking.pnp import moved
@@ -285,7 +285,7 @@ def test_the_result_replaces_the_nominal_layout(rig: Rig, tmp_path: Path) -> Non
     resized = rig.document.tags.model_copy(
         update={"platform": [other, *rig.document.tags.platform[1:]]}
     )
-    changed = replace(rig, document=rig.document.model_copy(update={"tags": resized}))
+    changed = rig_from_document(rig.document.model_copy(update={"tags": resized}))
     with pytest.raises(BadInput, match="made with sizes or numbers of tags"):
         changed.with_calibration(read)
 

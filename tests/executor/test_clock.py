@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from executor.realtime.scheduling import (
     SWITCH_INTERVAL,
     RealClock,
     SimulatedClock,
+    one_thread,
     prompt_threads,
     take_short_turns,
 )
@@ -202,6 +204,24 @@ def test_threads_take_turns_sooner_only_while_a_run_is_served() -> None:
     with prompt_threads():
         assert sys.getswitchinterval() == pytest.approx(SWITCH_INTERVAL)
     assert sys.getswitchinterval() == before
+
+
+def test_runs_side_by_side_leave_the_process_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second had restored what the first one had set."""
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("MKL_NUM_THREADS", "3")
+    before = sys.getswitchinterval()
+    first, second = ExitStack(), ExitStack()
+    for stack in (first, second):
+        stack.enter_context(prompt_threads())
+        stack.enter_context(one_thread())
+    first.close()
+    assert sys.getswitchinterval() == pytest.approx(SWITCH_INTERVAL)
+    assert (os.environ["OMP_NUM_THREADS"], os.environ["MKL_NUM_THREADS"]) == ("1", "1")
+    second.close()
+    assert sys.getswitchinterval() == before
+    assert "OMP_NUM_THREADS" not in os.environ
+    assert os.environ["MKL_NUM_THREADS"] == "3"
 
 
 def test_short_turns_change_nothing_but_the_slice() -> None:

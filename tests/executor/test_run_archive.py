@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+import pickle
 import re
 import shutil
 from collections.abc import Callable
@@ -315,6 +316,25 @@ def test_checksums_of_further_files_are_ignored(filmed: RunFolder, tmp_path: Pat
     sums.write_text(sums.read_text() + "report.html\n")
     with pytest.raises(BadInput, match="not a checksum"):
         cdpr.load_run(folder.path)
+
+
+def test_a_result_is_that_of_its_run_after_a_change_of_folder(
+    blind: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tables are read on first access: those of a `run` in the new folder had been read."""
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copytree(blind.path, tmp_path / "run")
+    monkeypatch.chdir(tmp_path)
+    loaded = cdpr.load_run("run")
+    assert repr(loaded).startswith("<RunResult PASSED in run: ")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert len(loaded.cycles["time_s"]) > 1
+    Path("run").mkdir()
+    Path("run/clearance.csv").write_text("of another run")
+    assert len(loaded.clearance["time_s"]) > 0
+    for one in (loaded, pickle.loads(pickle.dumps(loaded))):
+        assert one.folder == one.shown_folder == tmp_path / "run"
+        assert one.report in (None, tmp_path / "run" / "report.html")
 
 
 def test_a_summary_without_a_measured_clearance_has_none(blind: RunFolder) -> None:

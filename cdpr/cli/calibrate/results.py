@@ -14,7 +14,7 @@ from calibration.intrinsics.result import camera_named
 from calibration.result_files import compare, load_result, write_calibrated_rig
 from calibration.results import Calibration, Destination
 from cdpr.cli.arguments import argument, flag, option, required
-from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig, remark_on_verdicts
+from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, present, show_facts, show_json
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
@@ -107,7 +107,6 @@ def apply(
     """
     loaded = [load_result(path) for path in results]
     new = write_calibrated_rig(output, load_rig(rig), loaded, Terminal())
-    remark_on_verdicts(loaded)
     facts = [(f"{one.kind} {one.name}", f"{one.date}: {one.verdict}") for one in loaded]
     facts += [
         ("rig file", str(output)),

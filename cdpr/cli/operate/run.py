@@ -171,7 +171,7 @@ class MotionOptions:
 def show(result: RunResult, as_json: bool) -> None:
     """Shows the verdict of a run."""
     if as_json:
-        show_json({"run": str(result.folder), **result.summary})
+        show_json({"run": str(result.shown_folder), **result.summary})
         return
     verdict = f"[bold {COLOURS[result.verdict]}]{result.verdict}[/]"
     out.print(f"{verdict} {escape(result.sentence)}", soft_wrap=True)
@@ -182,7 +182,7 @@ def show(result: RunResult, as_json: bool) -> None:
 def show_files(result: RunResult, as_json: bool) -> None:
     """Shows the path of a run's report, and what could not be written."""
     if result.report is not None and not as_json:
-        line = f"report: {result.report}"
+        line = f"report: {result.shown_folder / result.report.name}"
         print_safely(lambda: show_line(line), result)
     if missing := result.missing_text():
         show_line(f"error: {missing}", err)

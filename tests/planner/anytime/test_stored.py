@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from model.files.documents import content_hash
+from model.rig import load_rig
+from model.scene import load_scene
+from planner.anytime import problem
+from planner.costs import KinematicCost
 from planner.kernels import jit as stored
+from planner.settings import Weights
 
+CONFIGS = Path(__file__).parents[3] / "configs"
 KEY = ["rig", {"mass": 0.4}]
 
 
@@ -89,3 +98,50 @@ def test_without_a_folder_every_run_computes(made, monkeypatch) -> None:
     take(made)
     take(made)
     assert made.times == 2
+
+
+@pytest.fixture
+def rig():
+    return load_rig(CONFIGS / "gachon_8_6.yaml")
+
+
+def test_costs_of_a_copy_with_other_values_are_not_those_of_the_rig(rig, folder) -> None:
+    """Both had one file: the rig's next plan stated the copy's costs, in every later process."""
+    rotation = rig.home.rotation
+    wanted = KinematicCost(rig, rotation).extremes
+    for file in folder.iterdir():
+        file.unlink()
+    for other in (
+        replace(rig, anchors=1.6 * rig.anchors),
+        replace(rig, outlets=1.1 * rig.outlets),
+        replace(rig, workspace_upper=rig.workspace_upper - 0.01),
+        replace(rig, max_tension=2.0 * rig.max_tension),
+    ):
+        assert KinematicCost(other, rotation).extremes != wanted
+    assert KinematicCost(rig, rotation).extremes == wanted
+
+
+def test_arrays_of_a_problem_are_stored_by_the_values_they_are_computed_from(
+    rig, monkeypatch
+) -> None:
+    scene, keys = load_scene(CONFIGS / "environment_1.yaml"), []
+    kinematic = KinematicCost(rig, scene.start.rotation)
+
+    def noted(name, key, shape, _compute):
+        keys.append((name, content_hash([np.asarray(part).tolist() for part in key])))
+        return np.zeros(shape)
+
+    monkeypatch.setattr(problem, "stored", noted)
+    monkeypatch.setattr(problem, "build_robot", lambda *_: None)  # it compiles for long
+    heavier = replace(scene.load, payload_mass=scene.load.payload_mass + 0.1)
+    for the_rig, the_scene in (
+        (rig, scene),
+        (rig, scene.changed(clearance=0.02)),
+        (replace(rig, anchors=1.01 * rig.anchors), scene),
+        (replace(rig, mass=2.0 * rig.mass), scene),
+        (replace(rig, max_tension=0.9 * rig.max_tension), scene),
+        (rig, replace(scene, load=heavier)),
+    ):
+        problem.problem_of(the_rig, the_scene, Weights(length=1.0), kinematic)
+    assert len(keys) == 12  # two names, and one key for each robot and load
+    assert len({*keys}) == 10
