@@ -148,10 +148,7 @@ def late_drives(
     behind = next((step for step in _STEPS[goal] if step.intersection(states)), frozenset())
     rows = zip(names.items(), states, status_words, commanded, strict=True)
     return [
-        (
-            node,
-            "; ".join([f"{name} is in {state.value} {late}", *_reasons(state, word, sent, bits)]),
-        )
+        (node, text(name, state, word, sent))
         for (node, name), state, word, sent in rows
         if state in behind
     ]
