@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -62,7 +63,10 @@ class RunResult:
     @property
     def shown_folder(self) -> Path:
         """The folder in messages: as it was given, while that path leads to it."""
-        return self._given if self._given.absolute() == self.folder else self.folder
+        with suppress(OSError):  # the current folder may have been removed
+            if self._given.absolute() == self.folder:
+                return self._given
+        return self.folder
 
     @property
     def verdict(self) -> str:

@@ -16,7 +16,7 @@ PERIOD_S = 0.01
 LIMIT_S = 0.02
 """A quiet computer wakes a thread within a few milliseconds, also beside one that computes."""
 REPEATS = 9
-"""Two suites beside four busy loops on two cores spoil two attempts of three at the longest test."""
+"""Two suites beside four busy loops on two cores spoil two of three attempts at the longest."""
 
 
 def reports_late_cycles(failure: str) -> bool:

@@ -249,7 +249,6 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
             where=f"rig {rig}, camera {camera.name!r}",
             next_step="pass a grey image; `cv2.imread` returns None for a file it cannot read",
         )
-    require_real(image)
     wanted = (camera.height, camera.width)
     if image.shape != wanted or image.dtype != np.uint8:
         size = " x ".join(map(str, image.shape[1::-1] if image.ndim > 1 else image.shape))
@@ -259,6 +258,7 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
             where=f"rig {rig}",
             next_step="use full-size images of this camera, or correct the rig file",
         )
+    require_real(image)  # none masked
 
 
 # Gamma.

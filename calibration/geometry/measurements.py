@@ -403,7 +403,7 @@ _NOT_AT_REST = 0.05
 
 def _verticals(table: CsvTable) -> Array:
     """Upward directions from accelerometers, shape (n, 3); empty without them."""
-    if not _has(table, "accel_[xyz]", "m_s2|ms2|mps2|g|mg"):
+    if not _has(table, "accel_[xyz]", r"m[\W_]*s[\W_]*[2²]|mps2|m?g"):
         return _nothing()
     unit = next((one for one in _AT_REST if _has(table, f"accel_[xyz]_{one}")), "m_s2")
     at_rest = _AT_REST[unit]

@@ -308,6 +308,7 @@ def test_an_acceleration_that_is_not_gravitys_is_refused(
         ("tension_1_kn,tension_2_kn", "'tension_1_n', 'tension_2_n'"),
         ("swivel_1_rad", "'swivel_1_deg', 'swivel_2_deg'"),
         ("accel_x,accel_y,accel_z", "'accel_x_m_s2', 'accel_y_m_s2', 'accel_z_m_s2'"),
+        *((f"accel_x{unit}", "'accel_x_m_s2'") for unit in ("_m/s2", "_m_s^2", " [m/s²]")),
         ("accel_y_g,accel_z_g", "'accel_x_g'"),
     ],
 )

@@ -47,8 +47,10 @@ def codes_in_the_source() -> Iterator[str]:
             index = CODE_ARGUMENT.get(name)
             if index is not None and len(node.args) > index:
                 code = node.args[index]
-                if isinstance(code, ast.Constant) and isinstance(code.value, str):
-                    yield code.value
+                either = (code.body, code.orelse) if isinstance(code, ast.IfExp) else (code,)
+                for one in either:
+                    if isinstance(one, ast.Constant) and isinstance(one.value, str):
+                        yield one.value
     yield from ("recorder", "supervisor_lost")  # reported in a loop, by name
     yield from (kind.code for kind in (BusFault, *BusFault.__subclasses__()))
 

@@ -243,7 +243,7 @@ def test_one_image_at_a_time_is_in_memory(
             order.append("written")
         add_message(self, channel, at, data, *more)
 
-    monkeypatch.setattr(RunFolder, "picture", reading)
+    monkeypatch.setattr(RunFolder, "image", reading)
     monkeypatch.setattr(Writer, "add_message", writing)
     poses, fused = folder.poses(), fused_table(run.cycles, run.poses)
     write_mcap(folder, run.context, run.cycles, poses, run.clearance, fused, {})

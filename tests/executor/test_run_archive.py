@@ -332,9 +332,15 @@ def test_a_result_is_that_of_its_run_after_a_change_of_folder(
     Path("run").mkdir()
     Path("run/clearance.csv").write_text("of another run")
     assert len(loaded.clearance["time_s"]) > 0
+    (tmp_path / "removed").mkdir()
     for one in (loaded, pickle.loads(pickle.dumps(loaded))):
+        monkeypatch.chdir(tmp_path / "elsewhere")
         assert one.folder == one.shown_folder == tmp_path / "run"
         assert one.report in (None, tmp_path / "run" / "report.html")
+    monkeypatch.chdir(tmp_path / "removed")
+    (tmp_path / "removed").rmdir()
+    assert loaded.shown_folder == tmp_path / "run"
+    monkeypatch.chdir(tmp_path)
 
 
 def test_a_summary_without_a_measured_clearance_has_none(blind: RunFolder) -> None:

@@ -326,7 +326,7 @@ def test_runs_that_begin_in_one_second_have_a_default_folder_each(
         return True
 
     result = runner.run(plan, rig, cameras=(), realtime=False, confirm=meanwhile)
-    assert result.folder == Path("runs/now-3")
+    assert result.folder == tmp_path / "runs/now-3"
     assert result.passed
     with pytest.raises(BadInput, match="exists already"):
         runner.run(plan, rig, folder="runs/now", cameras=(), realtime=False)
