@@ -205,14 +205,19 @@ def parallel_cables(rig: Rig) -> Rig:
     return rig_from_document(document.model_copy(update=changes))
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@pytest.fixture(scope="module", params=[0, 3])
+def weak_yaw(rig: Rig, request: pytest.FixtureRequest) -> tuple[Rig, Truth]:
+    """A rig with parallel cables that differs from its file, and its samples."""
+    built = rig_with_errors(parallel_cables(rig), request.param)
+    return built, samples(built, 60, tilt=np.radians(10.0), seed=request.param)
+
+
 @pytest.mark.parametrize("positions", [True, False])
 def test_a_weakly_determined_yaw_needs_no_measured_rotation(
-    rig: Rig, seed: int, positions: bool
+    weak_yaw: tuple[Rig, Truth], positions: bool
 ) -> None:
     """Lengths by the rig file alone rotate the platform far: a start, not a reason to refuse."""
-    built = rig_with_errors(parallel_cables(rig), seed)
-    truth = samples(built, 60, tilt=np.radians(10.0), seed=seed)
+    built, truth = weak_yaw
     data = followed(truth, REFLECTOR) if positions else truth.measured.without_poses()
     result = fit_rig(built, data, DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     assert len(result.measured) == 60

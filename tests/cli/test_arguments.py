@@ -213,11 +213,8 @@ def test_a_full_disk_behind_standard_output_is_reported(
     assert "Exception ignored" not in done.stderr
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", ">&- 2>&-"])
-def test_streams_that_were_closed_before_the_start_end_no_run(tmp_path: Path, closed: str) -> None:
-    """As by some service managers."""
-    plan = write_short_plan(tmp_path / "plan.json")
-    words = ("run", plan, "--rig", RIG, "--fast", "--no-camera", "-o", tmp_path / "run")
+def _with_closed(closed: str, *words: str | Path) -> None:
+    """Calls the program with closed streams, as some service managers do; it must succeed."""
     program = "from cdpr.cli import main; main()"
     done = subprocess.run(
         ["sh", "-c", f'exec "$0" "$@" {closed}', sys.executable, "-c", program, *map(str, words)],
@@ -228,6 +225,19 @@ def test_streams_that_were_closed_before_the_start_end_no_run(tmp_path: Path, cl
     )
     assert done.returncode == 0, done
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-"])
+def test_a_stream_that_was_closed_before_the_start_ends_no_check(
+    tmp_path: Path, closed: str
+) -> None:
+    _with_closed(closed, "check", write_short_plan(tmp_path / "plan.json"))
+
+
+def test_streams_that_were_closed_before_the_start_end_no_run(tmp_path: Path) -> None:
+    plan = write_short_plan(tmp_path / "plan.json")
+    options = ("--rig", RIG, "--fast", "--no-camera", "-o", tmp_path / "run")
+    _with_closed(">&- 2>&-", "run", plan, *options)
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["verdict"] == "PASSED"
     assert (tmp_path / "run" / "report.html").is_file()

@@ -60,8 +60,7 @@ STEPS = (
     (0, "calibrate poses REHEARSAL SCENE -o measure.json --count 10 --candidates 100"),
     (0, "calibrate rig REHEARSAL examples/rig_session/places.csv -o results"),
     (3, "calibrate rig REHEARSAL LENGTHS --without-poses --known drum_scale"),
-    (0, f"workspace configs/gachon_8_6.yaml -o maps {FEW}"),
-    (0, f"workspace configs/gachon_8_6.yaml --scene SCENE -o more {FEW}"),
+    (0, f"workspace configs/gachon_8_6.yaml --scene SCENE -o maps {FEW}"),
 )
 NOT_RUN = {
     "bench": "takes hours",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
@@ -10,10 +11,12 @@ import pytest
 
 from model.distances import convex_bodies, separation
 from model.errors import BadInput, NoSolution
+from model.files.plan_file import PlanDocument
 from model.files.scene_file import Payload, StopDocument
 from model.plan import load_plan, plan_from_document, save_plan
 from model.pose import Pose, interpolate
-from model.scene import Load, legs_of
+from model.rig import Rig
+from model.scene import Load, Scene, legs_of
 from model.shapes import Sphere
 from model.statics.gravity import working_tensions
 from planner.check import check_path, verify
@@ -37,6 +40,12 @@ def pick(name: str, at: tuple[float, float, float], kg: float, **keys: object) -
     return stop(name, *at, kind="pick", dwell_s=1.0, mass_kg=kg, **keys)
 
 
+@pytest.fixture(scope="module")
+def planned(gachon: Rig, ready_scene: Callable[[str], Scene]) -> PlanDocument:
+    """A plan through the stops of the example scene."""
+    return make_plan(gachon, ready_scene("pick_and_place"), OPTIMAL)
+
+
 @pytest.mark.parametrize("settings", SETTINGS, ids=["optimal", "paper", "rewire"])
 def test_a_plan_meets_every_stop_exactly_and_passes_its_check(
     gachon, ready_scene, settings, tmp_path
@@ -58,11 +67,9 @@ def test_a_plan_meets_every_stop_exactly_and_passes_its_check(
         assert np.nanmin(np.linalg.norm(nodes - ends, axis=1)) < 0.002
 
 
-def test_figures_of_a_plan_are_those_of_its_legs_with_their_loads(gachon, ready_scene) -> None:
+def test_figures_of_a_plan_are_those_of_its_legs_with_their_loads(gachon, planned) -> None:
     """Tensions by the working rule at dense poses, with masses written out here."""
-    scene = ready_scene("pick_and_place")
-    document = make_plan(gachon, scene, OPTIMAL)
-    plan = plan_from_document(document)
+    plan = plan_from_document(planned)
     bounds = [0, *plan.stops, len(plan.waypoints) - 1]
     lows, highs, length = [], [], 0.0
     masses = [0.0, 1.2, 1.2, 0.0, 0.5, 0.5, 0.0]
@@ -74,9 +81,9 @@ def test_figures_of_a_plan_are_those_of_its_legs_with_their_loads(gachon, ready_
                 tensions = working_tensions(gachon, interpolate(a, b, share), hanging).tensions
                 lows.append(tensions.min())
                 highs.append(tensions.max())
-    assert document.quality.length_mm == pytest.approx(length * 1000.0, rel=1e-6)
-    assert document.quality.min_tension_n == pytest.approx(min(lows), abs=0.1)
-    assert document.quality.max_tension_n == pytest.approx(max(highs), abs=0.1)
+    assert planned.quality.length_mm == pytest.approx(length * 1000.0, rel=1e-6)
+    assert planned.quality.min_tension_n == pytest.approx(min(lows), abs=0.1)
+    assert planned.quality.max_tension_n == pytest.approx(max(highs), abs=0.1)
 
 
 def test_the_parts_of_the_ready_scene_are_carried_over_the_wall(gachon, ready_scene) -> None:
@@ -105,9 +112,8 @@ def test_the_same_rounds_of_each_leg_give_the_same_path_again(gachon, ready_scen
     assert again.planner.rounds == rounds
 
 
-def test_a_leg_is_the_plan_that_its_ends_alone_would_have(gachon, ready_scene) -> None:
-    scene = ready_scene("pick_and_place")
-    whole = plan_from_document(make_plan(gachon, scene, OPTIMAL))
+def test_a_leg_is_the_plan_that_its_ends_alone_would_have(gachon, ready_scene, planned) -> None:
+    scene, whole = ready_scene("pick_and_place"), plan_from_document(planned)
     tray, over, shelf = whole.stops[:3]
     for first, last in ((tray, over), (over, shelf)):
         ends = {"start": whole.waypoints[first], "goal": whole.waypoints[last]}
@@ -202,8 +208,8 @@ def test_a_longest_path_and_wrong_rounds_are_refused_with_stops(gachon, scene_wi
         make_plan(gachon, scene, PlannerSettings(), rounds=[1, 1])
 
 
-def test_a_report_of_legs_can_be_written_as_json(gachon, ready_scene) -> None:
-    plan = plan_from_document(make_plan(gachon, ready_scene("pick_and_place"), OPTIMAL))
+def test_a_report_of_legs_can_be_written_as_json(planned) -> None:
+    plan = plan_from_document(planned)
     report = verify(plan).report
     assert json.dumps(report.as_dict(), allow_nan=False)
     motion = sum(a.distance_to(b) for a, b in pairwise(plan.waypoints))

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
-
-import pytest
 
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
 
@@ -46,26 +45,22 @@ def test_is_not_blamed_for_it():
 """
 
 
-def suite(folder: Path, text: str) -> subprocess.CompletedProcess[str]:
+def suite(folder: Path, **modules: str) -> subprocess.CompletedProcess[str]:
     """Runs a suite of its own under the same conftest, with only a short grace."""
     conftest = CONFTEST.read_text().replace("GRACE_S = 2.0", "GRACE_S = 0.05")
     (folder / "conftest.py").write_text(conftest)
-    (folder / "test_inner.py").write_text(text)
+    for name, text in modules.items():
+        (folder / f"{name}.py").write_text(text)
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-q", "--rootdir", "."]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
 
 
-def test_a_test_that_cleans_up_passes(tmp_path: Path) -> None:
-    run = suite(tmp_path, CLEAN)
-    assert run.returncode == 0, run.stdout
-
-
-@pytest.mark.parametrize(("text", "named"), [(THREAD, "thread 'forgotten'"), (PROCESS, "process ")])
-def test_a_leak_fails_the_test_that_made_it_and_no_other(
-    tmp_path: Path, text: str, named: str
-) -> None:
-    run = suite(tmp_path, text)
+def test_a_leak_fails_the_test_that_made_it_and_no_other(tmp_path: Path) -> None:
+    run = suite(tmp_path, test_clean=CLEAN, test_thread=THREAD, test_process=PROCESS)
     assert run.returncode == 1, run.stdout
-    assert "the test left running" in run.stdout
-    assert named in run.stdout
-    assert "2 passed, 1 error" in run.stdout
+    assert "5 passed, 2 errors" in run.stdout
+    found = re.findall(r"ERROR at teardown of (\w+) _+\s+the test left running: (.*)", run.stdout)
+    left = dict(found)
+    assert left.keys() == {"test_leaves_a_thread", "test_leaves_a_process"}, run.stdout
+    assert left["test_leaves_a_thread"] == "thread 'forgotten'"
+    assert re.match(r"process \d+ \(", left["test_leaves_a_process"])

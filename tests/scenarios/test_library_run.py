@@ -343,34 +343,37 @@ def test_limits_of_the_verbs_are_those_of_the_library(rig: Rig) -> None:
         jogging.jog_cable(rig, 0, 0.001, realtime=False)
 
 
+#: Each child makes the call for which it was started; `CALL` names it.
 UNGUARDED = """
+import os, sys
 import cdpr
 def confirm(_proposal):
     print("asked")
     return True
 plan, rig = cdpr.load_plan({plan!r}), cdpr.load_rig({rig!r})
-try:
-    cdpr.{call}, confirm=confirm)
-except cdpr.CdprError as error:
-    raise SystemExit("PARENT " + str(error))
+calls = {{
+    "run": lambda: cdpr.run(plan, rig, cameras=(), confirm=confirm),
+    "run with cameras": lambda: cdpr.run(plan, rig, confirm=confirm),
+    "home": lambda: cdpr.home(rig, at_home=True, confirm=confirm),
+    "jog": lambda: cdpr.jog(rig, None, by=[0, 0, 0.005], confirm=confirm),
+}}
+for name in [os.environ["CALL"]] if "CALL" in os.environ else {names!r}:
+    os.environ["CALL"] = name
+    try:
+        calls[name]()
+    except cdpr.CdprError as error:
+        print("PARENT", error, "END", sep="\\n", file=sys.stderr, flush=True)
 """
 
 
 @pytest.mark.parametrize(
-    ("call", "process", "in_file"),
-    [
-        ("run(plan, rig, cameras=()", "the real-time process", True),
-        ("run(plan, rig, cameras=()", "the real-time process", False),
-        ("run(plan, rig", "the process of camera", True),
-        ("home(rig, at_home=True", "the real-time process", True),
-        ("jog(rig, None, by=[0, 0, 0.005]", "the real-time process", True),
-    ],
+    ("names", "in_file"), [(("run", "run with cameras", "home", "jog"), True), (("run",), False)]
 )
 def test_a_script_without_the_guard_asks_once_and_is_named_as_the_cause(
-    short_plan: Path, tmp_path: Path, call: str, process: str, in_file: bool
+    short_plan: Path, tmp_path: Path, names: tuple[str, ...], in_file: bool
 ) -> None:
     """Its child imports it again; a script from standard input cannot be imported at all."""
-    text = UNGUARDED.format(plan=str(short_plan), rig=str(RIG), call=call)
+    text = UNGUARDED.format(plan=str(short_plan), rig=str(RIG), names=names)
     (tmp_path / "script.py").write_text(text)
     (tmp_path / "empty").mkdir()
     done = subprocess.run(
@@ -378,13 +381,17 @@ def test_a_script_without_the_guard_asks_once_and_is_named_as_the_cause(
         input=text, cwd=tmp_path / "empty", capture_output=True, text=True, check=False,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
-    before, _, of_parent = done.stderr.partition("PARENT ")
-    assert process in of_parent
-    assert "ended before it was ready (exit code 1)" in of_parent
-    assert 'if __name__ == "__main__"' in of_parent
-    assert "killed" not in of_parent
-    assert ("nothing moved" in of_parent) == (process == "the real-time process")
-    assert ("does not run it again" in before) == in_file
-    assert done.stdout.split() == ["asked"]
-    assert done.returncode == 1
+    *parts, rest = done.stderr.split("END\n")
+    for name, part in zip(names, parts, strict=True):
+        before, _, of_parent = part.partition("PARENT\n")
+        of_camera = name == "run with cameras"
+        assert ("the process of camera" if of_camera else "the real-time process") in of_parent
+        assert "ended before it was ready (exit code 1)" in of_parent
+        assert 'if __name__ == "__main__"' in of_parent
+        assert "killed" not in of_parent
+        assert ("nothing moved" in of_parent) != of_camera
+        assert ("does not run it again" in before) == in_file
+    assert rest == ""
+    assert done.stdout.split() == ["asked"] * len(names)
+    assert done.returncode == 0
     assert not [file for file in (tmp_path / "empty").rglob("*") if file.is_file()]

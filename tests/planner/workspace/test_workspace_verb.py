@@ -6,12 +6,14 @@ import csv
 import json
 import re
 import resource
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from typer.testing import CliRunner
 
 from cdpr.cli.app import build_app
@@ -21,7 +23,7 @@ from model.scene import legs_of, load_scene
 from model.statics.gravity import inertial_wrench
 from planner.costs import margin_reserve
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
-from planner.workspace.figures import space_scene
+from planner.workspace.figures import space_scene, write_figures
 from planner.workspace.files import write_maps
 from planner.workspace.grid import frame_box, parsed_slice, volume
 from planner.workspace.maps import Question
@@ -177,12 +179,26 @@ def test_a_folder_that_holds_something_is_left_alone(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
 
 
-def test_maps_replace_all_of_a_former_run_and_nothing_else(tmp_path, slice_maps, whole):
+def write_one_figure(folder: Path, drawn: Mapping[str, Callable[[], Figure]]) -> None:
+    """Draws one map of levels; the other figures are empty files, where only names count."""
+    for name, draw in drawn.items():
+        if name == "workspace_self_clearance":
+            write_figures(folder, {name: draw})
+        else:
+            for kind in ("png", "svg"):
+                (folder / f"{name}.{kind}").touch()
+
+
+def test_maps_replace_all_of_a_former_run_and_nothing_else(
+    tmp_path, slice_maps, whole, monkeypatch
+):
     """Also where that run ended before its summary; files without a map's arrays are others'."""
     question = slice_maps[1]
     planes = [parsed_slice("x=-50"), parsed_slice("z=400.5")]
     former = workspace_grids(question.rig, planes, volume=True, step=0.2)
-    write_maps(tmp_path, map_workspace(question, former, workers=1), question)
+    with monkeypatch.context() as quickly:
+        quickly.setattr("planner.workspace.files.write_figures", write_one_figure)
+        write_maps(tmp_path, map_workspace(question, former, workers=1), question)
     (tmp_path / "summary.json").unlink()
     made = {"slice_x_minus_50_costs.png", "slice_z_400.5.csv", "workspace.npz", "frame.svg"}
     assert made | {"workspace_self_clearance.png"} <= set(written(tmp_path))
