@@ -323,3 +323,50 @@ def test_each_step_towards_enabled_is_that_of_the_drive_furthest_behind(
 ) -> None:
     words = next_words(Goal.ENABLE, states, [False] * len(states))
     assert " ".join(word.name for word in words) == ENABLING[states]
+
+
+def test_a_drive_keeps_its_word_only_until_enable_operation_is_sent() -> None:
+    """A reply to 0Fh, and *switched on* after it, prove nothing: only a state below it does."""
+    unknown, ready, on = DriveState.NOT_READY, DriveState.READY_TO_SWITCH_ON, DriveState.SWITCHED_ON
+    sent = SentWords(1)
+    assert sent.kept([unknown]) == {}
+    steps = [
+        (ready, ControlWord.SHUTDOWN, True),
+        (ready, ControlWord.SWITCH_ON, True),
+        (unknown, ControlWord.SWITCH_ON, True),
+        (on, ControlWord.SWITCH_ON, True),
+        (on, ControlWord.ENABLE_OPERATION, False),
+        (ready, ControlWord.SHUTDOWN, False),
+        (on, ControlWord.SHUTDOWN, False),
+        (DriveState.OPERATION_ENABLED, ControlWord.SHUTDOWN, False),
+        (ready, ControlWord.SHUTDOWN, True),
+        (DriveState.FAULT, ControlWord.SHUTDOWN, False),
+    ]
+    for state, word, is_kept in steps:
+        sent.note([state], (word,))
+        assert sent.kept([unknown]) == ({0: word} if is_kept else {})
+        assert sent.kept([state]) == ({0: word} if is_kept and state is unknown else {})
+
+
+@pytest.mark.parametrize("state", [DriveState.SWITCHED_ON, DriveState.QUICK_STOP_ACTIVE])
+def test_a_stop_counts_only_if_it_was_sent_to_a_drive_that_had_stopped(state: DriveState) -> None:
+    stopped, stop, enable = [DriveState.QUICK_STOP_ACTIVE], ControlWord.QUICK_STOP, Goal.ENABLE
+    sent = SentWords(1)
+    assert sent.next_words(enable, stopped) == (stop,)
+    other = ControlWord.SHUTDOWN if state in stopped else stop
+    sent.note([state], (other,))
+    assert sent.next_words(enable, stopped) == (stop,)
+    sent.note(stopped, (stop,))
+    assert sent.next_words(enable, stopped) == (ControlWord.ENABLE_OPERATION,)
+
+
+@pytest.mark.parametrize("state", sorted(WITHOUT_TORQUE - {DriveState.SWITCHED_ON}, key=str))
+def test_for_a_release_enabled_drives_are_disabled_first(state: DriveState) -> None:
+    states = [DriveState.OPERATION_ENABLED, state]
+    found = next_words(Goal.RELEASE, states, [False] * 2)
+    assert found == (ControlWord.SWITCH_ON, ControlWord.SHUTDOWN)
+
+
+@pytest.mark.parametrize("goal", [goal for goal in Goal if goal is not Goal.RESET_FAULT])
+def test_no_drive_is_reset_unasked(goal: Goal) -> None:
+    assert next_words(goal, [DriveState.FAULT], [False]) != (ControlWord.RESET_FAULT,)
