@@ -418,7 +418,7 @@ class SentWords:
 
         Each of them showed a state without torque, and was not sent "enable operation" since. Many
         drives pass through codes outside the standard while they change their state: another word
-        would take them back.
+        would take them back. A stop leads nowhere and is not kept.
 
         Args:
             states: As last reported.
@@ -427,7 +427,7 @@ class SentWords:
         return {
             drive: word
             for drive, (state, word, at_rest) in rows
-            if at_rest and state is DriveState.NOT_READY
+            if at_rest and state is DriveState.NOT_READY and word is not ControlWord.QUICK_STOP
         }
 
     def next_words(self, goal: Goal, states: Sequence[DriveState]) -> tuple[ControlWord, ...]:

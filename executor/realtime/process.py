@@ -165,8 +165,7 @@ class RealTimeProcess:
         doubt = self._check_drives(self._never_enabled)
         if doubt:
             self.report_event("not_held", doubt)
-        found = doubt or ("all that had torque hold on their own" if is_lost else "")
-        cause = f"{error.what}; {found}" if found else error.what
+        cause = f"{error.what}; {doubt}" if doubt else error.what
         return Ended(State.LATCHED, cause, holding=not doubt, true_pose=None)
 
     def read_status(self) -> CycleStatus:

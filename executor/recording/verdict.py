@@ -16,6 +16,7 @@ from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord, RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
+from executor.safety.fault_messages import NO_MORE
 from executor.safety.limits import tension_limits
 from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
@@ -98,8 +99,7 @@ class Verdict:
     @property
     def reasons(self) -> list[str]:
         """Sentences of the failed checks; of all checks if none failed."""
-        failed = [check.text for check in self.checks if not check.passed]
-        return failed or [check.text for check in self.checks]
+        return [c.text for c in self.checks if not c.passed] or [c.text for c in self.checks]
 
 
 def judge(
@@ -115,7 +115,7 @@ def judge(
     """
     course, rig, scene = context.course, context.rig, context.plan.scene
     final_state, began = course.final_state, cycles.path_began
-    warnings = dict.fromkeys(context.texts_of("drive_warning"))
+    warnings = dict.fromkeys(t.removesuffix(NO_MORE) for t in context.texts_of("drive_warning"))
     measured = [
         following(cycles, rig.motion.following_error),
         replies(cycles, course.simulated, bool(context.texts_of("drive_silent"))),

@@ -119,6 +119,8 @@ def late(cycles: float, *, too_late: bool) -> Alarm:
 #: Events of one note, such as the missed set-points of one drive, in a motion: a disturbed bus
 #: would fill the record with more.
 NOTE_EVENTS = 10
+#: End of the text of the last one.
+NO_MORE = "; no more are recorded"
 
 
 class AlarmHistory:
@@ -141,7 +143,7 @@ class AlarmHistory:
         self._seen[_identity(alarm)] = cycle, events
         if not is_new:
             return ""
-        return f"{alarm.text}; no more are recorded" if events == NOTE_EVENTS else alarm.text
+        return f"{alarm.text}{NO_MORE}" if events == NOTE_EVENTS else alarm.text
 
 
 def _identity(alarm: Alarm) -> tuple[str, str]:

@@ -159,7 +159,8 @@ def test_only_a_drive_that_showed_no_torque_and_was_not_enabled_since_keeps_its_
             if unknown[drive]:
                 assert word is not ControlWord.ENABLE_OPERATION
                 if has_no_torque(history, drive) and not stops and FAULTED.isdisjoint(states):
-                    assert word is former[drive]
+                    stopped = former[drive] is ControlWord.QUICK_STOP
+                    assert word is (plain if stopped else former)[drive]
                 elif not has_no_torque(history, drive):
                     assert word is plain[drive]
         if goal is Goal.STOP or (goal is Goal.ENABLE and not FAULTED.isdisjoint(states)):
@@ -247,6 +248,8 @@ def test_drives_that_show_unknown_codes_on_the_way_are_enabled_and_released(
         step(Goal.IDLE)
     run(Goal.ENABLE, DriveState.OPERATION_ENABLED)
     run(Goal.STOP, DriveState.QUICK_STOP_ACTIVE)
+    run(Goal.RELEASE, DriveState.READY_TO_SWITCH_ON)
+    run(Goal.ENABLE, DriveState.OPERATION_ENABLED)
 
 
 @pytest.mark.parametrize("words", [(0x06, "SHUTDOWN SHUTDOWN"), (0x07, "SWITCH_ON SWITCH_ON")])
@@ -370,3 +373,10 @@ def test_for_a_release_enabled_drives_are_disabled_first(state: DriveState) -> N
 @pytest.mark.parametrize("goal", [goal for goal in Goal if goal is not Goal.RESET_FAULT])
 def test_no_drive_is_reset_unasked(goal: Goal) -> None:
     assert next_words(goal, [DriveState.FAULT], [False]) != (ControlWord.RESET_FAULT,)
+
+
+def test_a_stop_is_not_kept_when_a_drive_at_rest_is_to_be_released() -> None:
+    sent = SentWords(1)
+    sent.note([DriveState.READY_TO_SWITCH_ON], (ControlWord.QUICK_STOP,))
+    found = sent.next_words(Goal.RELEASE, [DriveState.NOT_READY])
+    assert found == (ControlWord.SHUTDOWN,)

@@ -113,7 +113,7 @@ def test_a_drive_that_is_not_enabled_in_time_says_what_keeps_it(word: int, said:
 
 @pytest.mark.parametrize("word", [0x0740, 0x0721, 0x0540])
 def test_bits_that_a_make_uses_otherwise_are_no_reason(word: int) -> None:
-    """A maxon EPOS is enabled from there; it was said to have no mains power."""
+    """A maxon EPOS2 is enabled from there; it was said to have no mains power."""
     commanded = (ControlWord.ENABLE_OPERATION,) * 2
     ((_, text),) = late_drives({4: "a", 5: "b"}, (word, 0x0237), commanded, Goal.ENABLE, 1.0, 0)
     assert "bit" not in text

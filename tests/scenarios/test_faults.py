@@ -19,6 +19,7 @@ from drivers.cia402.state_machine import DriveState
 from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
+from executor.safety.fault_messages import NOTE_EVENTS
 from executor.state_machine import State
 from executor.supervision import OperatorRequests, StopReason
 from executor.trajectory.setpoints import PreparedRun, Trajectory, prepare
@@ -232,7 +233,7 @@ def test_a_mere_warning_of_a_drive_ends_no_run(
     monkeypatch.setattr(ProfileDocument, "is_warning", lambda _profile, code: code == 0x3280)
 
     def warn(stage: Stage) -> None:
-        if stage.cycle in (CRUISING, CRUISING + 1, CRUISING + 2, CRUISING + 30):
+        if stage.cycle in (CRUISING + 1, *range(CRUISING, CRUISING + 28, 2)):
             stage.drives[2]._emergency(0x3280)
 
     with staged(prepared, tmp_path / "run", warn) as stage:
@@ -240,7 +241,7 @@ def test_a_mere_warning_of_a_drive_ends_no_run(
         assert outcome.state is State.FINISHED
         reported = [event.text for event in stage.events() if event.code == "drive_warning"]
         checks = concluded(stage, outcome)["checks"]
-    assert len(reported) == 2
+    assert len(reported) == NOTE_EVENTS
     assert "3280h" in reported[0]
     assert [check["name"] for check in checks].count("drive_warning") == 1
 
