@@ -117,7 +117,7 @@ class RigMeasurements:
 
     def origins(self, rotations: Array) -> Array:
         """Measured positions of the platform's origin with given rotations, shape (n, 3), [m]."""
-        return self.positions - self.measured_points(np.zeros_like(self.positions), rotations)
+        return self.positions - self._arms(rotations)
 
     def pose_errors(self, positions: Array, rotations: Array) -> Array:
         """Twists from measured to given poses, shape (n, 6), [m, rad]; 0 where not measured.

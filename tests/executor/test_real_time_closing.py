@@ -83,6 +83,24 @@ def test_a_process_killed_before_it_was_ready_moved_nothing(
     assert "__main__" not in str(caught.value)
 
 
+def end_of(
+    monkeypatch: pytest.MonkeyPatch, serve: Callable[..., None], doubt: str
+) -> tuple[Ended, list[LoopEvent]]:
+    """The end of a motion in a process that does what is given, and its events."""
+    monkeypatch.setattr(real_time_process, "serve", serve)
+    board, events = SharedRequests(), list[LoopEvent]()
+    records: Any = SimpleNamespace(take_event=events.append)
+    motion_on_board: Any = (Still(), print, board)
+    try:
+        with real_time_process.real_time_process(
+            *motion_on_board, need_real_time=False, check_drives=lambda _released: doubt
+        ) as process:
+            process.arm(records)
+            return process.run(), events
+    finally:
+        board.close()
+
+
 @pytest.mark.parametrize(
     ("serve", "code"),
     [
@@ -95,20 +113,7 @@ def test_a_process_killed_before_it_was_ready_moved_nothing(
 def test_a_motion_that_did_not_begin_is_recorded_with_its_own_cause(
     monkeypatch: pytest.MonkeyPatch, serve: Callable[..., None], code: str
 ) -> None:
-    monkeypatch.setattr(real_time_process, "serve", serve)
-    board, events = SharedRequests(), list[LoopEvent]()
-    records: Any = SimpleNamespace(take_event=events.append)
-    motion_on_board: Any = (Still(), print, board)
-    try:
-        with real_time_process.real_time_process(
-            *motion_on_board,
-            need_real_time=False,
-            check_drives=lambda _released: "drive 3 is in fault",
-        ) as process:
-            process.arm(records)
-            ended = process.run()
-    finally:
-        board.close()
+    ended, events = end_of(monkeypatch, serve, "drive 3 is in fault")
     assert [event.code for event in events] == [code, "not_held"]
     assert (ended.state, ended.holding) == (State.LATCHED, False)
     assert events[0].text in ended.cause
@@ -124,18 +129,7 @@ def test_a_motion_that_did_not_begin_is_recorded_with_its_own_cause(
 def test_drives_that_were_not_seen_to_hold_are_not_said_to_hold(
     monkeypatch: pytest.MonkeyPatch, doubt: str, cause: str
 ) -> None:
-    monkeypatch.setattr(real_time_process, "serve", dies)
-    board, events = SharedRequests(), list[LoopEvent]()
-    records: Any = SimpleNamespace(take_event=events.append)
-    motion_on_board: Any = (Still(), print, board)
-    try:
-        with real_time_process.real_time_process(
-            *motion_on_board, need_real_time=False, check_drives=lambda _released: doubt
-        ) as process:
-            process.arm(records)
-            ended = process.run()
-    finally:
-        board.close()
+    ended, events = end_of(monkeypatch, dies, doubt)
     assert ended.cause.endswith(f"; {cause}")
     assert " hold" not in events[0].text + ended.cause
 
