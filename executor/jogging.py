@@ -227,9 +227,7 @@ def _free_to_turn(scene: Scene, poses: tuple[Pose, ...]) -> Scene:
     """The scene with rotation limits that include these orientations."""
     first, last = poses[0].quaternion, poses[-1].quaternion
     tilt, turn = np.degrees(largest_rotations(first, last))
-    limits = RotationLimitsDocument(
-        tilt_deg=min(90.0, float(tilt) + 0.1), turn_deg=min(180.0, float(turn) + 0.1)
-    )
+    limits = RotationLimitsDocument.containing(float(tilt) + 0.1, float(turn) + 0.1)
     return scene_from_document(scene.document.model_copy(update={"rotation_limits": limits}))
 
 

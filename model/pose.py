@@ -387,7 +387,7 @@ class RotationLimits:
     """The orientations that a scene allows, measured from the level, unrotated platform.
 
     Attributes:
-        tilt: Largest angle between the platform's z axis and the vertical, [rad], at most π/2.
+        tilt: Largest angle between the platform's z axis and the vertical, [rad]; π for any.
         turn: Largest turn about the vertical, in either direction, [rad]; π for any.
     """
 

@@ -302,8 +302,6 @@ def _with_stops(scene: Scene, chosen: Sequence[Pose], dwell: float) -> Scene:
     changes = {
         "stops": stops,
         "goal": scene.document.start,
-        "rotation_limits": RotationLimitsDocument(
-            tilt_deg=float(min(tilt, 90)), turn_deg=float(min(turn, 180))
-        ),
+        "rotation_limits": RotationLimitsDocument.containing(float(tilt), float(turn)),
     }
     return scene_from_document(scene.document.model_copy(update=changes))

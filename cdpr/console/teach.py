@@ -204,7 +204,7 @@ def _rotation_limits(poses: Sequence[TaughtPose]) -> RotationLimitsDocument:
     quaternions = [one.pose().quaternion for one in poses]
     largest = np.degrees([largest_rotations(a, b) for a, b in pairwise(quaternions)])
     tilt, turn = (largest.max(axis=0) + 1.0).tolist()
-    return RotationLimitsDocument(tilt_deg=min(90.0, tilt), turn_deg=min(180.0, turn))
+    return RotationLimitsDocument.containing(tilt, turn)
 
 
 def _is_at(pose: Pose, other: Pose) -> bool:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field
@@ -260,12 +260,24 @@ class LoadDocument(Document):
 class RotationLimitsDocument(Document):
     """Limits of the platform's tilt and turn, measured from the level, unrotated platform."""
 
-    tilt_deg: Annotated[float, Field(ge=0, le=90, allow_inf_nan=False)] = Field(
-        description="largest angle of the platform's z axis from the vertical"
+    tilt_deg: Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)] = Field(
+        description="largest angle of the platform's z axis from the vertical; 180 for any"
     )
     turn_deg: Annotated[float, Field(ge=0, le=180, allow_inf_nan=False)] = Field(
         description="largest rotation about the vertical, either direction; 180 for any"
     )
+
+    @classmethod
+    def containing(cls, tilt_deg: float, turn_deg: float) -> Self:
+        """Limits that contain rotations of up to these angles.
+
+        The turn is free where the tilt exceeds 90°: towards 180° it changes by any amount between
+        neighbouring orientations.
+        """
+        return cls(
+            tilt_deg=min(180.0, tilt_deg),
+            turn_deg=180.0 if tilt_deg > 90.0 else min(180.0, turn_deg),
+        )
 
 
 class SceneDocument(Document):

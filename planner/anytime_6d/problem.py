@@ -118,7 +118,7 @@ def rotations_kept(tilt: float, turn: float, start: Array, end: Array) -> bool:
         for pose, sign in ((start, first), (end, last)):
             if not sign * pose[3] > 0.0 or not 2.0 * math.atan2(abs(pose[6]), abs(pose[3])) <= turn:
                 return False
-    bound = math.sin(tilt / 2.0) ** 2
+    bound = math.sin(tilt / 2.0) ** 2 if tilt < math.pi else 2.0
     at_start, at_end = start[4] ** 2 + start[5] ** 2, end[4] ** 2 + end[5] ** 2
     if not max(at_start, at_end) <= bound:
         return False

@@ -8,13 +8,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from drivers.cia402.state_machine import DriveState
+from executor.jogging import plan_straight_move
 from executor.recording.run_folder import RunFolder
 from executor.trajectory.setpoints import PreparedRun
+from model.plan import plan_from_document
+from model.pose import Pose
 from model.rig import load_rig
+from model.scene import empty_scene
+from planner.check import verify
 from tests.cli.plans import RIG
 from tests.cli.program import call, one_message
+from tests.planner.anytime_6d.rotating_scenes import upside_down
 from tests.scenarios.test_real_time import drives_on
 
 BY = ("--by-mm", "6", "0", "8")
@@ -34,6 +41,14 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_is(tmp_path: Path)
     assert speeds.max() <= 0.005 * (1 + 1e-6)
     goal = load_rig(RIG).home.position + np.array([0.006, 0.0, 0.008])
     assert cycles.encoder[-1] == pytest.approx(goal, abs=1e-5)
+
+
+def test_a_platform_frame_that_points_down_is_jogged_home_like_any_other() -> None:
+    rig = upside_down(load_rig(RIG))
+    tilted = rig.home.rotation @ Rotation.from_euler("x", 3.0, degrees=True).as_matrix()
+    start = Pose(rig.home.position + 0.005, tilted)
+    plan = plan_from_document(plan_straight_move(rig, empty_scene(rig), start, rig.home))
+    assert verify(plan).plan.waypoints[-1].angle_to(rig.home) < 1e-6
 
 
 @pytest.mark.parametrize(

@@ -9,10 +9,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from model.clearance import ClearanceModel
+from model.files.documents import PoseDocument
 from model.files.scene_file import SceneDocument
 from model.kinematics import structure_matrix
 from model.pose import Array, Pose, interpolate
-from model.rig import Rig, load_rig
+from model.rig import Rig, load_rig, rig_from_document
 from model.scene import Scene, load_scene, scene_from_document
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
@@ -57,6 +58,22 @@ def random_pose(rng: np.random.Generator, rig: Rig, scene: Scene) -> Pose:
     spun = Rotation.from_rotvec([0.0, 0.0, rng.uniform(-limits.turn, limits.turn)])
     position = rng.uniform(rig.workspace_lower, rig.workspace_upper)
     return Pose(position, (tipped * spun).as_matrix())
+
+
+def upside_down(rig: Rig) -> Rig:
+    """The same robot with the platform's frame turned over: z down where it was up."""
+    flip = np.diag([1.0, -1.0, -1.0])
+    home = rig.home
+    document = rig.document
+    platform = document.platform.model_copy(
+        update={
+            "home": PoseDocument.of(Pose(home.position, home.rotation @ flip)),
+            "centre_of_mass_mm": (flip @ document.platform.centre_of_mass_mm).tolist(),
+        }
+    )
+    anchors = (np.asarray(document.anchors_mm) @ flip).tolist()
+    changes = {"platform": platform, "anchors_mm": anchors, "tags": None, "cameras": []}
+    return rig_from_document(document.model_copy(update=changes))
 
 
 class Judge:

@@ -63,9 +63,16 @@ def test_the_length_of_a_move_counts_its_turning(seed: int) -> None:
     assert move_length(row(start), row(end), 0.11) == pytest.approx(expected, abs=1e-9)
 
 
-@given(seeds, st.floats(0.02, 1.5), st.floats(0.02, 3.1))
-def test_compiled_limits_are_those_of_the_scene(seed: int, tilt: float, turn: float) -> None:
-    start, end = two_poses(seed, 0.4)
+@given(
+    seeds,
+    st.sampled_from([0.4, 1.5]),
+    st.floats(0.02, 3.1) | st.just(np.pi),
+    st.floats(0.02, 3.1) | st.just(np.pi),
+)
+def test_compiled_limits_are_those_of_the_scene(
+    seed: int, size: float, tilt: float, turn: float
+) -> None:
+    start, end = two_poses(seed, size)
     found = largest_rotations(start.quaternion, end.quaternion)
     if min(abs(found[0] - tilt), abs(found[1] - turn)) < 1e-5:
         return

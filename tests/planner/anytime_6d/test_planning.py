@@ -8,9 +8,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from model.errors import BadInput, InvalidFile, NoSolution
 from model.files.plan_file import PlanDocument
+from model.files.documents import PoseDocument
 from model.plan import load_plan, plan_facts, plan_from_document, save_plan
 from model.pose import Pose
 from model.rig import Rig
@@ -28,6 +30,7 @@ from tests.planner.anytime_6d.rotating_scenes import (
     Judge,
     quaternion,
     turning,
+    upside_down,
 )
 
 ROUNDS = TurningSettings(rounds=60)
@@ -64,6 +67,17 @@ def test_the_example_scene_is_planned_and_an_independent_judge_finds_no_fault() 
     assert 6.0 <= tilt <= 8.0
     assert "rotated up to" in rotation
     assert document.planner.rounds == [60]
+
+
+def test_a_platform_frame_whose_z_axis_points_down_is_planned_like_any_other() -> None:
+    rig = upside_down(GACHON)
+    over = Rotation.from_quat([0.0, 1.0, 0.0, 0.0], scalar_first=True)
+    ends = {}
+    for name, pose in (("start", RAMP.start), ("goal", RAMP.goal)):
+        turned = Pose(pose.position, (Rotation.from_matrix(pose.rotation) * over).as_matrix())
+        ends[name] = PoseDocument.of(turned).model_dump()
+    document = proved(rig, turning("turn", 180.0, 180.0, **ends), ROUNDS)
+    assert document.quality.length_mm < 800.0
 
 
 def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> None:
