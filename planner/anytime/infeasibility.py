@@ -176,12 +176,12 @@ def no_path(
     values["best_distance_mm"] = gap * 1e3
     if is_separated(problem.world, search.ends[0], search.ends[1]):
         return NoSolution(
-            "there is no path: the obstacles separate start and goal",
+            "there is no path without rotation: the obstacles separate start and goal",
             where=where,
             why=f"proved by workspace cells that a cable or the platform excludes as a whole, at"
             f" {scene.obstacle_clearance * 1e3:g} mm clearance and 0.05 mm reserve;"
             f" {_blocking_pairs(rig, scene, problem, search)}",
-            next_step="reduce the clearance, or move the goal or an obstacle",
+            next_step=f"{_rotate(scene)}, reduce the clearance, or move the goal or an obstacle",
             values={**values, "proved": "yes"},
         )
     return NoSolution(
@@ -192,6 +192,12 @@ def no_path(
         " goal or an obstacle",
         values=values,
     )
+
+
+def _rotate(scene: Scene) -> str:
+    """The way out that the proof, at the orientation of the start, leaves open."""
+    limits = "" if scene.rotation_limits else "add rotation_limits to the scene and "
+    return f"{limits}plan with `free_rotation=True`"
 
 
 def _gap(search: AnytimeSearch) -> float:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from model.errors import NoSolution
+from model.pose import Pose
+from model.rig import Rig
+from model.scene import Scene
 from planner.anytime.infeasibility import FINENESSES, flood_reaches, is_separated
+from planner.check import check_path
 from planner.planning import make_plan
 from planner.settings import OBJECTIVES, OptimalSettings
 from tests.planner.anytime.scenes_of_the_search import (
@@ -80,10 +86,46 @@ def test_a_proved_wall_names_what_blocks_the_path(gachon, divided) -> None:
         make_plan(gachon, divided, OptimalSettings(rounds=12))
     message = str(nothing.value)
     assert nothing.value.exit_code == 1
-    assert "there is no path: the obstacles separate start and goal" in message
+    assert "there is no path without rotation: the obstacles separate start and goal" in message
     assert "10 mm clearance" in message
     assert "post at 0 0" in message
     assert nothing.value.values["proved"] == "yes"
+
+
+def test_the_proof_states_that_it_holds_without_rotation(gachon) -> None:
+    """A tilted platform passes below a knob that blocks the level one."""
+    document = gachon.as_dict()
+    document["platform"]["size_mm"] = [130, 130, 20]
+    document["workspace"] = {"lower_mm": [-110, -1, 444], "upper_mm": [110, 1, 446]}
+    knob = {"name": "knob", "sphere": {"radius_mm": 5}, "position_mm": [0, 69.5, 454]}
+    parts = {
+        "schema_version": 1,
+        "name": "rail",
+        "start": {"position_mm": [-100, 0, 445]},
+        "goal": {"position_mm": [100, 0, 445]},
+        "clearance": {"obstacle_mm": 1, "self_mm": 2},
+        "obstacles": [knob],
+    }
+    limits = {"rotation_limits": {"tilt_deg": 20, "turn_deg": 5}}
+    rig, fixed, free = (
+        Rig.from_dict(document),
+        Scene.from_dict(parts),
+        Scene.from_dict(parts | limits),
+    )
+    for scene, cure in (
+        (fixed, "add rotation_limits to the scene and plan with"),
+        (free, "plan with"),
+    ):
+        with pytest.raises(NoSolution, match="no path without rotation") as nothing:
+            make_plan(rig, scene, OptimalSettings(rounds=12))
+        assert nothing.value.next_step.startswith(f"{cure} `free_rotation=True`")
+    tilted = [math.cos(math.radians(-3.0)), math.sin(math.radians(-3.0)), 0.0, 0.0]
+    path = [
+        fixed.start,
+        *(Pose.from_quaternion(np.array([x, 0.0, 0.445]), tilted) for x in (-0.09, 0.09)),
+        fixed.goal,
+    ]
+    assert check_path(rig, free, path).passed
 
 
 def test_a_search_that_ends_too_early_says_that_nothing_is_proved(

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from model.errors import BadInput, InvalidFile, NoSolution
-from model.files.plan_file import PlanDocument
 from model.files.documents import PoseDocument
+from model.files.plan_file import PlanDocument
 from model.plan import load_plan, plan_facts, plan_from_document, save_plan
 from model.pose import Pose
 from model.rig import Rig
