@@ -1,29 +1,27 @@
-"""The CAN bus of a rig, opened through python-can, and the CAN interfaces of Linux."""
+"""The CAN bus of a rig, opened through python-can."""
 
 from __future__ import annotations
 
 import copy
 import errno
 import ipaddress
-import json
 import os
-import shutil
 import socket
 import stat
 import struct
-import subprocess
 import time
 import traceback
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import can
+from can.interfaces.pcan.pcan import PCAN_BITRATES
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
 from drivers.can_errors import bus_fault, bus_name
+from drivers.can_interfaces import bring_up, require_usable
 from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
 
@@ -47,11 +45,6 @@ RECEIVE_BUFFER_BYTES = 4 * 2**20
 SO_MEMINFO = 55
 MEMINFO_BYTES = 36
 """Nine counters; the last is the number of dropped frames. Source: linux/sock_diag.h."""
-
-MIN_TRANSMIT_QUEUE = 64
-"""Frames that a kernel CAN interface must queue: a cycle and a stop in one burst, and a margin."""
-
-INTERFACES = Path("/sys/class/net")
 
 
 class SentFrame(can.Message):
@@ -154,7 +147,7 @@ def open_bus(settings: BusSettings) -> can.BusABC:
             next_step=f"use one of: {', '.join(known)}",
         )
     if settings.interface == "socketcan":
-        _check_kernel_interface(settings)
+        require_usable(settings.channel, settings.bitrate)
     if settings.interface == IN_PROCESS:
         return InProcessBus(settings.channel)
     options = _options(settings)
@@ -184,6 +177,12 @@ def _close_unopened(error: Exception) -> None:
 def _options(settings: BusSettings) -> dict[str, Any]:
     if settings.interface == "udp_multicast":
         return _udp_options(settings)
+    if settings.interface == "pcan" and settings.bitrate not in PCAN_BITRATES:
+        raise BadInput(  # python-can would use 500 kbit/s
+            f"adapters by PEAK have no bit rate of {settings.bitrate} bit/s",
+            where="bus.bitrate",
+            next_step=f"use one of: {', '.join(map(str, sorted(PCAN_BITRATES)))}",
+        )
     options: dict[str, Any] = {"channel": settings.channel, "bitrate": settings.bitrate}
     if settings.interface == "neovi":  # its default is to receive them
         options["receive_own_messages"] = False
@@ -221,66 +220,6 @@ def _is_multicast(group: str) -> bool:
         return False
 
 
-def _check_kernel_interface(settings: BusSettings) -> None:
-    """Checks what python-can notices only at the first frame, or never: the bit rate."""
-    folder = INTERFACES / settings.channel
-    if not settings.channel or not folder.exists():
-        present = sorted(p.name for p in INTERFACES.glob("*can*"))
-        raise HardwareMissing(
-            f"there is no network interface {settings.channel!r}",
-            where=f"bus {settings}",
-            why=f"CAN interfaces here: {', '.join(present) or 'none'}",
-            next_step=bring_up(settings),
-        )
-    if not int((folder / "flags").read_text(), 16) & 1:  # IFF_UP
-        raise HardwareMissing(
-            f"the network interface {settings.channel} is down",
-            where=f"bus {settings}",
-            next_step=bring_up(settings),
-        )
-    queue = int((folder / "tx_queue_len").read_text())
-    if queue < MIN_TRANSMIT_QUEUE:
-        raise HardwareMissing(
-            f"the transmit queue of {settings.channel} holds {queue} frames,"
-            f" at least {MIN_TRANSMIT_QUEUE} are needed",
-            where=f"bus {settings}",
-            why="a stop is sent as one batch, which must fit in the queue after a cycle",
-            next_step=f"sudo ip link set {settings.channel} txqueuelen 128",
-            values={"tx_queue_len": queue},
-        )
-    rates: dict[str, int | None] = {settings.channel: None}  # as of a serial adapter (slcand)
-    with suppress(HardwareMissing):  # without `ip`, which `cdpr doctor` reports
-        rates |= {each.name: each.bitrate for each in can_interfaces()}
-    rate = rates[settings.channel]
-    if rate not in (None, settings.bitrate):
-        raise HardwareMissing(
-            f"{settings.channel} runs at {rate} bit/s; the rig file states {settings.bitrate}",
-            where=f"bus {settings}",
-            why="the bus load is checked at the bit rate of the rig file",
-            next_step=f"correct bus.bitrate, or {set_up_again(settings.channel, settings.bitrate)}",
-            values={"bitrate": rate},
-        )
-
-
-def set_up_again(name: str, bitrate: int) -> str:
-    """The command that sets a bit rate; it can be set only while the interface is down."""
-    return (
-        f"sudo ip link set {name} down && sudo ip link set {name} up txqueuelen 128"
-        f" type can bitrate {bitrate}"
-    )
-
-
-def bring_up(settings: BusSettings) -> str:
-    """The command that brings a kernel CAN interface up."""
-    name = settings.channel or "can0"
-    if name.startswith("vcan"):
-        return (
-            f"sudo modprobe vcan && sudo ip link add dev {name} type vcan"
-            f" && sudo ip link set {name} up txqueuelen 128"
-        )
-    return f"sudo ip link set {name} up txqueuelen 128 type can bitrate {settings.bitrate}"
-
-
 def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
     cause = error.__cause__ or error
     number = getattr(cause, "errno", None)
@@ -291,7 +230,7 @@ def _cannot_open(settings: BusSettings, error: Exception) -> HardwareMissing:
             " (slcan, robotell, seeedstudio, serial): pip install 'python-can[serial]'"
         )
     if settings.interface == "socketcan":
-        step = bring_up(settings)
+        step = bring_up(settings.channel, settings.bitrate)
         if number == errno.EAFNOSUPPORT:
             step = "load the kernel's CAN support: sudo modprobe can_raw"
     elif settings.interface == "udp_multicast":
@@ -371,79 +310,3 @@ def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
         raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
-
-
-# CAN interfaces of Linux: state, bit rate, queue, state of the controller.
-#: Folders of `ip` for users whose PATH has no system folders.
-SYSTEM_FOLDERS = ("/usr/sbin", "/sbin")
-
-
-@dataclass(frozen=True, slots=True)
-class KernelInterface:
-    """One CAN interface of the kernel.
-
-    Attributes:
-        name: Such as ``can0``.
-        kind: ``can`` with a controller, which has a bit rate, or ``vcan`` without.
-        up: Whether it is up.
-        queue: Length of the transmit queue, [frames].
-        bitrate: [bit/s]; None if not set, or if the driver states none, as with slcand.
-        state: Of the controller, such as ``ERROR-ACTIVE``; empty if the driver states none.
-    """
-
-    name: str
-    kind: str
-    up: bool
-    queue: int
-    bitrate: int | None
-    state: str
-
-
-def parse_interfaces(text: str) -> tuple[KernelInterface, ...]:
-    """CAN interfaces in the output of ``ip -details -json link show``.
-
-    Raises:
-        ValueError: The text is not such output.
-    """
-    listed = json.loads(text or "[]")
-    return tuple(_interface(link) for link in listed if link.get("link_type") == "can")
-
-
-def _interface(link: dict[str, Any]) -> KernelInterface:
-    details = link.get("linkinfo", {})
-    data = details.get("info_data", {})
-    return KernelInterface(
-        name=link["ifname"],
-        kind=details.get("info_kind", "can"),
-        up="UP" in link["flags"],
-        queue=int(link.get("txqlen", 0)),
-        bitrate=data.get("bittiming", {}).get("bitrate") or data.get("bittiming_bitrate") or None,
-        state=data.get("state", ""),
-    )
-
-
-def can_interfaces() -> tuple[KernelInterface, ...]:
-    """All CAN interfaces of this machine.
-
-    Raises:
-        HardwareMissing: The program ``ip`` is missing or fails.
-    """
-    path = os.pathsep.join((os.environ.get("PATH", ""), *SYSTEM_FOLDERS))
-    program = shutil.which("ip", path=path)
-    if program is None:
-        raise HardwareMissing(
-            "the program `ip`, which lists interfaces, is not installed",
-            where="SocketCAN",
-            next_step="sudo apt-get install iproute2",
-        )
-    shown = subprocess.run(
-        [program, "-details", "-json", "link", "show"], capture_output=True, text=True, check=False
-    )
-    try:
-        return parse_interfaces(shown.stdout)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise HardwareMissing(
-            f"`ip` did not list the interfaces: {shown.stderr.strip() or error}",
-            where="SocketCAN",
-            next_step="run `ip -details -json link show` manually",
-        ) from error

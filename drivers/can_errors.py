@@ -50,7 +50,10 @@ class BusOff(BusFault):
 
     code = "bus_off"
     cause = "a short circuit, a wrong bit rate, or missing termination"
-    remedy = "measure 60 ohm between CAN-H and CAN-L, compare the bit rates, then start again"
+    remedy = (
+        "measure 60 ohm between CAN-H and CAN-L, compare the bit rates, take the interface down and"
+        " up (`cdpr doctor RIG` shows how), then start again"
+    )
 
 
 class BusPassive(BusFault):
@@ -195,6 +198,7 @@ ERROR_CYCLES = 10
 class ErrorClass(IntFlag):
     """Class of an error frame, in its identifier."""
 
+    LOST_ARBITRATION = 0x02
     CONTROLLER = 0x04
     BUS_OFF = 0x40
 
@@ -243,7 +247,13 @@ class ErrorFrames:
         self._in_a_row = 0
 
     def take(self, frame: can.Message) -> BusFault | None:
-        """Counts an error frame; returns the fault it reports, if any."""
+        """Counts an error frame; returns the fault it reports, if any.
+
+        Lost arbitration is no error: the frame waits for one of higher priority.
+        """
+        lost = frame.arbitration_id == ErrorClass.LOST_ARBITRATION
+        if lost and isinstance(self._bus, WITH_CLASSES):
+            return None
         self.total += 1
         self._now += 1
         return error_frame_fault(self._bus, frame)

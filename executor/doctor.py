@@ -21,13 +21,21 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from drivers.can_interfaces import (
+    MIN_TRANSMIT_QUEUE,
+    UNUSABLE_MODES,
+    KernelInterface,
+    bring_up,
+    can_interfaces,
+    set_up_again,
+)
 from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, PRIORITY, has_capability
 from model.errors import BadInput, CdprError, without_passwords
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 if TYPE_CHECKING:
-    from drivers.can_bus import BusSettings, KernelInterface
+    from drivers.can_bus import BusSettings
     from drivers.cia402.inspection import Examined
 
 PACKAGES = (
@@ -179,7 +187,7 @@ def rig_bus(rig: Rig) -> list[MachineCheck]:
     adapter during a motion.
     """
     # Imported after the check of libraries: needs python-can.
-    from drivers.can_bus import IN_PROCESS, BusSettings, can_interfaces, open_bus
+    from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
     from drivers.can_load import check_bus_load
     from executor.interlock.locks import SetUpLock
 
@@ -242,8 +250,6 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
         settings: The rig's bus.
         interfaces: The CAN interfaces of this machine.
     """
-    from drivers.can_bus import bring_up, set_up_again  # needs python-can
-
     name = settings.channel
     kernel = kernel_support()
     if not kernel.good:
@@ -252,10 +258,11 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
     if found is None:
         there = ", ".join(interface.name for interface in interfaces) or "none"
         text = f"missing; CAN interfaces here: {there}"
-        return [MachineCheck(f"interface {name}", False, text, bring_up(settings))]
-    checks = [_up(found, settings), _queue(found)]
+        fix = bring_up(name, settings.bitrate)
+        return [MachineCheck(f"interface {name}", False, text, fix)]
+    checks = [_up(found, settings.bitrate), _queue(found)]
     if found.kind == "can":
-        again = set_up_again(name, settings.bitrate)
+        again = set_up_again(found, settings.bitrate)
         checks += [_bitrate(found, settings.bitrate, again), _controller(found, again)]
     return checks
 
@@ -271,16 +278,12 @@ def kernel_support() -> MachineCheck:
     return MachineCheck("kernel", True, "SocketCAN is available")
 
 
-def _up(found: KernelInterface, settings: BusSettings) -> MachineCheck:
-    from drivers.can_bus import bring_up  # needs python-can
-
+def _up(found: KernelInterface, bitrate: int) -> MachineCheck:
     text = f"{found.kind}, {'up' if found.up else 'down'}"
-    return MachineCheck(f"interface {found.name}", found.up, text, bring_up(settings))
+    return MachineCheck(f"interface {found.name}", found.up, text, bring_up(found.name, bitrate))
 
 
 def _queue(found: KernelInterface) -> MachineCheck:
-    from drivers.can_bus import MIN_TRANSMIT_QUEUE  # needs python-can
-
     return MachineCheck(
         f"txqueuelen of {found.name}",
         found.queue >= MIN_TRANSMIT_QUEUE,
@@ -304,6 +307,10 @@ def _controller(found: KernelInterface, again: str) -> MachineCheck:
     healthy = not found.state or found.state in HEALTHY
     fix = f"check power, cable and termination (60 ohm), then {again}"
     text = found.state or "not stated by its driver"
+    hindering = [mode for mode in found.modes if mode in UNUSABLE_MODES]
+    if hindering:
+        why = "; ".join(UNUSABLE_MODES[mode] for mode in hindering)
+        text, healthy, fix = f"{text}, {', '.join(hindering)}: {why}", False, again
     # While down it has no state to report; `_up` reports that.
     return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
 

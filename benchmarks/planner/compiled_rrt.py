@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.anytime.problem import PathProblem, edge_allowed
-from planner.anytime.random import State, seeded, uniform
 from planner.anytime.state import Handle
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, kernel, leaf
-from planner.kernels.primitives import Vector, along, minus, norm
+from planner.kernels.primitives import State, Vector, along, minus, norm, seeded, uniform
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]

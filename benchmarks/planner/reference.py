@@ -20,9 +20,9 @@ from planner.anytime.lattice_path import lattice_path
 from planner.anytime.local_search import MOST_VERTICES, Polyline, measure, polish
 from planner.anytime.path import advance, handle_of
 from planner.anytime.problem import KINEMATIC, LENGTH, UNIT, VERTEX, PathProblem, problem_of
-from planner.anytime.random import seeded
 from planner.anytime.state import BEST, new_search
 from planner.costs import KinematicCost
+from planner.kernels.primitives import seeded
 from planner.settings import Weights
 from planner.space import Lattice
 

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.anytime.problem import PathProblem, edge_allowed
-from planner.anytime.random import State, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, leaf
-from planner.kernels.primitives import Vector
+from planner.kernels.primitives import RandomState, Vector, uniform
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -31,7 +30,7 @@ _FROM_INSIDE = 0.25
 def connect(
     problem: PathProblem,
     ends: Array,
-    state: State,
+    state: RandomState,
     trees: Array,
     parents: Integers,
     counts: Integers,
@@ -78,7 +77,7 @@ def connect(
 
 
 @inlined
-def _sample(problem: PathProblem, state: State) -> Vector:
+def _sample(problem: PathProblem, state: RandomState) -> Vector:
     """A point of the workspace, most often on its walls, edges or in its corners.
 
     Obstacles leave more room there: samples drawn from a box twice as wide and clamped to the walls
@@ -94,7 +93,7 @@ def _sample(problem: PathProblem, state: State) -> Vector:
 
 
 @inlined
-def _drawn(state: State, wide: float, low: float, high: float) -> float:
+def _drawn(state: RandomState, wide: float, low: float, high: float) -> float:
     share = 0.5 + wide * (uniform(state) - 0.5)
     return low + min(max(share, 0.0), 1.0) * (high - low)
 

@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.anytime.problem import KINEMATIC, LENGTH, PathProblem, edge_allowed, interpolated
-from planner.anytime.random import State, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import kernel
-from planner.kernels.primitives import Vector, minus, norm
+from planner.kernels.primitives import RandomState, Vector, minus, norm, uniform
 
 # A binary heap in two arrays, smallest key first.
 
@@ -96,7 +95,7 @@ _OPEN = -2
 def lattice_path(
     problem: PathProblem,
     ends: Array,
-    state: State,
+    state: RandomState,
     stride: int,
     spread: float,
     points: Array,

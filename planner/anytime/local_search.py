@@ -23,10 +23,18 @@ from planner.anytime.problem import (
     edge_lows,
     gained,
 )
-from planner.anytime.random import State, below, direction, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import leaf
-from planner.kernels.primitives import Vector, along, dot, minus
+from planner.kernels.primitives import (
+    RandomState,
+    Vector,
+    along,
+    below,
+    direction,
+    dot,
+    minus,
+    uniform,
+)
 
 # A path under improvement, and the only operation that changes it.
 #
@@ -216,7 +224,7 @@ _NOWHERE = (0.0, 0.0, 0.0)
 
 
 @leaf
-def polish(problem: PathProblem, line: Polyline, state: State, trials: int) -> None:
+def polish(problem: PathProblem, line: Polyline, state: RandomState, trials: int) -> None:
     """Tries random kinds of changes at random positions.
 
     A successful move of vertices is repeated in the same direction by growing distances.
@@ -236,7 +244,7 @@ def polish(problem: PathProblem, line: Polyline, state: State, trials: int) -> N
 
 
 @leaf
-def _kind(line: Polyline, state: State) -> int:
+def _kind(line: Polyline, state: RandomState) -> int:
     """The kind of change to try. Source of the shares: measured on the paper's scenes."""
     choice = uniform(state)
     if line.counts[0] < 3 or choice < 0.05:
@@ -253,7 +261,7 @@ def _kind(line: Polyline, state: State) -> int:
 
 
 @leaf
-def _size(state: State) -> float:
+def _size(state: RandomState) -> float:
     """The size of a move, log-uniform."""
     return _SMALLEST * math.exp(uniform(state) * math.log(_LARGEST / _SMALLEST))
 
@@ -264,7 +272,9 @@ def _vertex(line: Polyline, k: int) -> Vector:
 
 
 @leaf
-def _drawn(line: Polyline, state: State, kind: int, heading: Vector, size: float) -> PathChange:
+def _drawn(
+    line: Polyline, state: RandomState, kind: int, heading: Vector, size: float
+) -> PathChange:
     """A change of the given kind at a random position."""
     vertices = line.counts[0]
     if kind == _CUT:
@@ -290,7 +300,7 @@ def _drawn(line: Polyline, state: State, kind: int, heading: Vector, size: float
 
 
 @leaf
-def _cut(line: Polyline, state: State) -> PathChange:
+def _cut(line: Polyline, state: RandomState) -> PathChange:
     """A straight line from somewhere on one edge to somewhere on a later one."""
     edges = line.counts[0] - 1
     first = below(state, edges - 1)

@@ -19,10 +19,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner.anytime.problem import PathProblem, edge_allowed
-from planner.anytime.random import State, below, direction, uniform
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, leaf
-from planner.kernels.primitives import Vector, along, cross, dot, minus, norm
+from planner.kernels.primitives import (
+    RandomState,
+    Vector,
+    along,
+    below,
+    cross,
+    direction,
+    dot,
+    minus,
+    norm,
+    uniform,
+)
 from planner.kernels.scene_arrays import World
 
 Array = NDArray[np.float64]
@@ -50,7 +60,7 @@ _ANY_OTHER = -1
 def through_passages(
     problem: PathProblem,
     ends: Array,
-    state: State,
+    state: RandomState,
     nodes: Array,
     above: Integers,
     parts: Integers,
@@ -156,7 +166,7 @@ def _add(
 
 
 @inlined
-def _anywhere(world: World, state: State) -> Vector:
+def _anywhere(world: World, state: RandomState) -> Vector:
     low, high = world.limits[0], world.limits[1]
     return (
         low[0] + uniform(state) * (high[0] - low[0]),
@@ -166,7 +176,7 @@ def _anywhere(world: World, state: State) -> Vector:
 
 
 @inlined
-def _out_of_obstacles(world: World, state: State, at: Vector) -> tuple[Vector, int, int]:
+def _out_of_obstacles(world: World, state: RandomState, at: Vector) -> tuple[Vector, int, int]:
     """A point projected out of obstacles, and the last two planes it was projected onto.
 
     Planes are indices of `World.planes`, -1 for none. The point may still be too near to something.
@@ -190,7 +200,7 @@ def _out_of_obstacles(world: World, state: State, at: Vector) -> tuple[Vector, i
 
 
 @inlined
-def _worst(world: World, state: State, at: Vector) -> tuple[int, float]:
+def _worst(world: World, state: RandomState, at: Vector) -> tuple[int, float]:
     """A plane of the pair with the least room at a position, and that room, [m].
 
     -1 where all pairs are separated.
@@ -223,7 +233,7 @@ def _room(world: World, k: int, at: Vector) -> float:
 @inlined
 def _add_segments(
     problem: PathProblem,
-    state: State,
+    state: RandomState,
     nodes: Array,
     above: Integers,
     parts: Integers,

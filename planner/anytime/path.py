@@ -35,10 +35,10 @@ from planner.anytime.problem import (
     problem_of,
     set_weights,
 )
-from planner.anytime.random import uniform
 from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
 from planner.kernels.jit import kernel, leaf
+from planner.kernels.primitives import uniform
 from planner.path import LengthLimit, Progress, Route
 from planner.settings import OptimalSettings, least_rounds
 from planner.wrench.translation import edge_held

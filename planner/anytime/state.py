@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from planner.anytime.connect import NODES
 from planner.anytime.local_search import MOST_VERTICES
 from planner.anytime.passages import ROADMAP_NODES
-from planner.anytime.random import State, seeded
+from planner.kernels.primitives import RandomState, seeded
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -61,7 +61,7 @@ class AnytimeSearch(NamedTuple):
     made: Integers
     totals: Integers
     first: Array
-    state: State
+    state: RandomState
 
 
 @structref.register

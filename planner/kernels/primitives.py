@@ -1,4 +1,7 @@
-"""Vectors of three floats as tuples: compiled code keeps them in registers."""
+"""What compiled code is built from: vectors of three floats as tuples, and random numbers.
+
+Compiled code keeps such tuples in registers.
+"""
 
 from __future__ import annotations
 
@@ -299,3 +302,45 @@ def triangle_segment_squared(a: Vector, b: Vector, c: Vector, start: Vector, end
         ),
         min(face_point_squared(a, b, c, start), face_point_squared(a, b, c, end)),
     )
+
+
+# Random numbers for compiled searches: one word of state, the same on every machine.
+# Source: Steele, Lea & Flood, "Fast splittable pseudorandom number generators", 2014 (SplitMix64).
+
+RandomState = NDArray[np.uint64]
+
+_GAMMA = np.uint64(0x9E3779B97F4A7C15)
+_FIRST = np.uint64(0xBF58476D1CE4E5B9)
+_SECOND = np.uint64(0x94D049BB133111EB)
+_UNIT = 2.0**-53
+
+
+def seeded(seed: int) -> RandomState:
+    """The state for a seed, shape (1,); kernels advance it in place."""
+    return np.array([seed % 2**64], dtype=np.uint64)
+
+
+@leaf
+def uniform(state: RandomState) -> float:
+    """A number in [0, 1)."""
+    state[0] += _GAMMA
+    mixed = state[0]
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * _FIRST
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * _SECOND
+    mixed = mixed ^ (mixed >> np.uint64(31))
+    return float(mixed >> np.uint64(11)) * _UNIT
+
+
+@leaf
+def below(state: RandomState, count: int) -> int:
+    """A whole number in 0 … count - 1."""
+    return int(uniform(state) * count)
+
+
+@leaf
+def direction(state: RandomState) -> Vector:
+    """A unit vector, uniform on the sphere."""
+    height = 2.0 * uniform(state) - 1.0
+    turn = 2.0 * math.pi * uniform(state)
+    radius = math.sqrt(max(0.0, 1.0 - height * height))
+    return (radius * math.cos(turn), radius * math.sin(turn), height)

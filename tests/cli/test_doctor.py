@@ -21,15 +21,9 @@ import numpy as np
 import pytest
 from packaging.requirements import Requirement
 
-from drivers import can_bus
 from drivers.cameras import live as cameras
-from drivers.can_bus import (
-    BusSettings,
-    KernelInterface,
-    can_interfaces,
-    open_bus,
-    parse_interfaces,
-)
+from drivers.can_bus import BusSettings, open_bus
+from drivers.can_interfaces import KernelInterface, can_interfaces, parse_interfaces
 from executor import doctor
 from executor.doctor import (
     MachineCheck,
@@ -41,6 +35,7 @@ from executor.doctor import (
 )
 from executor.interlock import locks
 from executor.interlock.locks import SetUpLock
+from model.errors import HardwareMissing
 from model.rig import load_rig, rig_from_document
 from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.plans import RIG
@@ -161,6 +156,19 @@ def test_a_serial_adapter_set_up_by_slcand_states_no_bit_rate(
     assert answers["controller of can0"].text == state
 
 
+@pytest.mark.parametrize("mode", ["LISTEN-ONLY", "ONE-SHOT", "LOOPBACK"])
+def test_a_controller_in_a_mode_that_hinders_is_named_with_its_cure(mode: str) -> None:
+    info = {"state": "ERROR-ACTIVE", "ctrlmode": ["FD", mode], "bittiming": {"bitrate": 1_000_000}}
+    answer = looked(linkinfo={"info_kind": "can", "info_data": info})["controller of can0"]
+    assert not answer.good
+    assert f"ERROR-ACTIVE, {mode}: " in answer.text
+    assert answer.fix.endswith(f"type can bitrate 1000000 {mode.lower()} off")
+    info["ctrlmode"] = ["FD", "BERR-REPORTING"]
+    good = looked(linkinfo={"info_kind": "can", "info_data": info})["controller of can0"]
+    assert good.good
+    assert good.text == "ERROR-ACTIVE"
+
+
 def test_a_missing_interface_names_those_that_are_there() -> None:
     (answer,) = kernel_bus(CAN0, [KernelInterface("can1", "can", True, 128, 500_000, "")])
     assert not answer.good
@@ -188,7 +196,7 @@ def test_unexpected_output_of_ip_is_reported(tmp_path: Path) -> None:
     program.chmod(0o755)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATH", str(tmp_path), prepend=":")
-        with pytest.raises(can_bus.HardwareMissing, match="did not list"):
+        with pytest.raises(HardwareMissing, match="did not list"):
             can_interfaces()
 
 

@@ -10,8 +10,9 @@ import can
 import pytest
 from can.interfaces.udp_multicast import bus as udp_bus
 
-from drivers import can_bus as bus_module
-from drivers.can_bus import BusSettings, InProcessBus, KernelInterface, SentFrame, open_bus
+from drivers import can_interfaces
+from drivers.can_bus import BusSettings, InProcessBus, SentFrame, open_bus
+from drivers.can_interfaces import KernelInterface
 from drivers.can_load import bus_load, check_bus_load, cycle_bits, heartbeat_cycles
 from model.errors import BadInput, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
@@ -94,7 +95,7 @@ def test_a_kernel_interface_that_is_down_or_short_of_queue_is_reported(
     folder.mkdir()
     (folder / "flags").write_text(f"{flags}\n")
     (folder / "tx_queue_len").write_text(f"{queue}\n")
-    monkeypatch.setattr(bus_module, "INTERFACES", tmp_path)
+    monkeypatch.setattr(can_interfaces, "INTERFACES", tmp_path)
     with pytest.raises(HardwareMissing) as caught:
         open_bus(BusSettings("socketcan", "can0"))
     assert what in caught.value.what
@@ -110,16 +111,16 @@ def test_a_kernel_interface_at_another_bit_rate_is_not_opened(
     folder.mkdir()
     (folder / "flags").write_text("0x40081\n")
     (folder / "tx_queue_len").write_text("128\n")
-    monkeypatch.setattr(bus_module, "INTERFACES", tmp_path)
+    monkeypatch.setattr(can_interfaces, "INTERFACES", tmp_path)
     found = (
         KernelInterface("can1", "can", True, 128, 125_000, ""),
         KernelInterface("can0", "can", True, 128, rate, ""),
     )
     monkeypatch.setattr(can, "Bus", lambda **_options: InProcessBus("same-rate"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    monkeypatch.setattr(bus_module, "SYSTEM_FOLDERS", ())
+    monkeypatch.setattr(can_interfaces, "SYSTEM_FOLDERS", ())
     open_bus(BusSettings("socketcan", "can0", 1_000_000)).shutdown()  # no `ip` shows the rate
-    monkeypatch.setattr(bus_module, "can_interfaces", lambda: found)
+    monkeypatch.setattr(can_interfaces, "can_interfaces", lambda: found)
     settings = BusSettings("socketcan", "can0", 1_000_000)
     if not refused:
         open_bus(settings).shutdown()
@@ -130,6 +131,51 @@ def test_a_kernel_interface_at_another_bit_rate_is_not_opened(
         open_bus(settings)
     assert "bus.bitrate" in caught.value.next_step
     assert "ip link set can0 down" in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("state", "modes", "what"),
+    [
+        ("BUS-OFF", (), "state BUS-OFF"),
+        ("STOPPED", (), "state STOPPED"),
+        ("ERROR-ACTIVE", ("FD", "LISTEN-ONLY"), "mode LISTEN-ONLY"),
+        ("ERROR-ACTIVE", ("ONE-SHOT",), "mode ONE-SHOT"),
+        ("ERROR-ACTIVE", ("LOOPBACK",), "mode LOOPBACK"),
+        ("ERROR-PASSIVE", ("BERR-REPORTING", "FD", "TRIPLE-SAMPLING"), ""),
+        ("", (), ""),
+    ],
+)
+def test_a_controller_that_cannot_command_drives_is_not_opened(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    state: str,
+    modes: tuple[str, ...],
+    what: str,
+) -> None:
+    """It is up, and every frame is lost: the drives were said to have no power."""
+    folder = tmp_path / "can0"
+    folder.mkdir()
+    (folder / "flags").write_text("0x40081\n")
+    (folder / "tx_queue_len").write_text("128\n")
+    monkeypatch.setattr(can_interfaces, "INTERFACES", tmp_path)
+    monkeypatch.setattr(can, "Bus", lambda **_options: InProcessBus("ready"))
+    found = KernelInterface("can0", "can", True, 128, 1_000_000, state, modes)
+    monkeypatch.setattr(can_interfaces, "can_interfaces", lambda: (found,))
+    if not what:
+        open_bus(BusSettings("socketcan", "can0")).shutdown()
+        return
+    with pytest.raises(HardwareMissing, match=what) as caught:
+        open_bus(BusSettings("socketcan", "can0"))
+    assert "sudo ip link set can0 down && sudo ip link set can0 up" in caught.value.next_step
+    for mode in modes:
+        assert (f" {mode.lower()} off" in caught.value.next_step) == (mode in what)
+
+
+def test_a_bit_rate_that_an_adapter_by_peak_does_not_have_is_refused() -> None:
+    """python-can opened it at 500 kbit/s without a word."""
+    with pytest.raises(BadInput, match="no bit rate of 400000") as caught:
+        open_bus(BusSettings("pcan", "PCAN_USBBUS1", 400_000))
+    assert "500000, 800000, 1000000" in caught.value.next_step
 
 
 def test_what_a_back_end_raises_becomes_hardware_missing() -> None:

@@ -168,6 +168,20 @@ def test_errors_that_do_not_cease_end_a_run_too() -> None:
     assert errors.total == fault.values["error_frames"] == 2 * ERROR_CYCLES - 1
 
 
+def test_lost_arbitration_is_no_error() -> None:
+    """Drivers such as sja1000 report each; the frame is sent after the one that won."""
+    with open_bus(BusSettings("virtual", "arbitration")) as bus:
+        errors = ErrorFrames(bus)
+        adapter = ErrorFrames(Adapter(bus))
+    for _ in range(3 * ERROR_CYCLES):
+        assert errors.take(error_frame(0x002, bytes(8))) is None
+        assert errors.end_cycle() is None
+    assert errors.total == 0
+    errors.take(error_frame(0x00A, bytes(8)))  # with a protocol error
+    adapter.take(error_frame(0x002, bytes(8)))  # a code of the maker
+    assert errors.total == adapter.total == 1
+
+
 def test_a_frame_that_the_kernel_threw_away_is_counted() -> None:
     with open_bus(BusSettings("udp_multicast", free_udp_channel())) as bus:
         with socket.socket(fileno=socket.dup(bus.fileno())) as its_socket:

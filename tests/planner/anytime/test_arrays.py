@@ -12,7 +12,7 @@ from scipy.interpolate import RegularGridInterpolator
 
 from planner.anytime.lattice_path import pop, push
 from planner.anytime.problem import interpolated
-from planner.anytime.random import below, direction, seeded, uniform
+from planner.kernels.primitives import below, direction, seeded, uniform
 from planner.space import Lattice, corners_and_weights
 
 KEYS = st.lists(st.one_of(st.none(), st.integers(-20, 20)), max_size=80)

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from planner.anytime.lattice_path import lattice_path
 from planner.anytime.problem import edge_allowed, interpolated
-from planner.anytime.random import seeded
+from planner.kernels.primitives import seeded
 from planner.settings import OBJECTIVES
 from tests.planner.anytime.scenes_of_the_search import ends_of, problem
 

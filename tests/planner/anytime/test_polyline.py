@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from planner.anytime.local_search import PathChange, cost_of, measure, polish, replace
 from planner.anytime.problem import CAPACITY, CLEARANCE, VERTEX, edge_allowed, edge_cost
-from planner.anytime.random import seeded
 from planner.costs import KinematicCost
+from planner.kernels.primitives import seeded
 from planner.settings import OBJECTIVES, Weights
 from tests.planner.anytime.scenes_of_the_search import ends_of, polyline, problem, searched
 
