@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import errno
 import os
 import signal
 import socket
@@ -219,6 +221,62 @@ def test_folder_and_socket_are_closed_to_others(folders):
             (file,) = folder.iterdir()
             assert folder.stat().st_mode & 0o777 == 0o700
             assert file.stat().st_mode & 0o077 == 0
+
+
+READ_ONLY = OSError(errno.EROFS, "Read-only file system")
+
+
+def _refuse_in(monkeypatch: pytest.MonkeyPatch, *refusing: Path) -> None:
+    """Folders in which no socket can be created, as on a failing disk."""
+    for path in refusing:
+        path.mkdir(mode=0o700)
+    inodes, listen = [path.stat().st_ino for path in refusing], command_socket._listen_in
+
+    def listen_in(folder: int, name: str) -> socket.socket:
+        if os.fstat(folder).st_ino in inodes:
+            raise READ_ONLY
+        return listen(folder, name)
+
+    monkeypatch.setattr(command_socket, "_listen_in", listen_in)
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_folder_in_which_no_socket_can_be_made_is_not_used_while_there_is_another(
+    folders, monkeypatch, k
+):
+    _refuse_in(monkeypatch, folders[k])
+    with advertised() as listeners:
+        assert (len(listeners), _reached()) == (1, [os.getpid()])
+        assert list(folders[k].iterdir()) == []
+    assert list(folders[1 - k].iterdir()) == []
+    with commands_from_start("run", RIG, Supervisor(), realtime=False):
+        assert stop_runs().stopped == (os.getpid(),)
+
+
+def test_a_run_is_refused_where_no_socket_can_be_made(folders, monkeypatch):
+    _refuse_in(monkeypatch, *folders)
+    with pytest.raises(Refused, match="would not reach this run") as caught, advertised():
+        pass
+    assert caught.value.why == "Read-only file system"
+    assert all(str(folder) in caught.value.where for folder in folders)
+
+
+def test_a_socket_that_cannot_be_removed_keeps_no_stop_from_other_runs(folders, monkeypatch):
+    """Left by a program that was killed before its disk failed."""
+    folders[0].mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as listener:
+        monkeypatch.chdir(folders[0])
+        listener.bind("77.sock")
+    real = os.unlink
+
+    def unlink(name: Any, **where: Any) -> None:
+        if name == "77.sock":
+            raise READ_ONLY
+        real(name, **where)
+
+    monkeypatch.setattr(os, "unlink", unlink)
+    with commands_from_start("run", RIG, Supervisor(), realtime=False):
+        assert stop_runs().stopped == (os.getpid(),)
 
 
 def test_a_link_instead_of_the_socket_is_not_followed(folders, tmp_path):
@@ -522,6 +580,77 @@ def test_a_stop_during_the_check_of_a_plan_ends_the_run(folders, tmp_path, monke
         begin[verb](realtime=False)
     assert stopped == [(os.getpid(),)]
     assert list(tmp_path.glob("runs/*")) == []
+
+
+@pytest.mark.parametrize("verb", [*VERBS, "reset"])
+def test_ctrl_c_at_the_question_of_a_verb_in_a_coroutine_ends_it(
+    folders, tmp_path, monkeypatch, verb
+):
+    """The handler of asyncio would only cancel the coroutine at its next ``await``."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(service, "faults_to_release_under", lambda _rig: (None, ()))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    reset = partial(service.reset, RIG.with_bus("udp_multicast", "239.74.9.9"))
+
+    def confirm(_: object) -> bool:
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    async def main() -> None:
+        before = signal.getsignal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            (VERBS | {"reset": reset})[verb](confirm=confirm)
+        assert signal.getsignal(signal.SIGINT) is before is not signal.default_int_handler
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("verb", ["run", "jog"])
+def test_ctrl_c_during_the_check_of_a_plan_in_a_coroutine_ends_the_run(
+    folders, tmp_path, monkeypatch, verb
+):
+    monkeypatch.chdir(tmp_path)
+    plan = fake_run.make(rate_hz=1.0, every=100, camera=False).context.plan
+
+    def compute(*_: object) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        raise Refused("Ctrl-C had no effect")
+
+    monkeypatch.setattr(runner, "prepare_plan", compute)
+    monkeypatch.setattr(jogging, "plan_straight_move", compute)
+
+    async def main() -> None:
+        if verb == "run":
+            runner.run(plan, plan.rig, cameras=[], realtime=False)
+        else:
+            jogging.jog(VIRTUAL, None, to_home=True, realtime=False)
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(main())
+    assert list(tmp_path.glob("runs/*")) == []
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_ctrl_c_in_a_coroutine_stops_a_motion(folders, realtime):
+    supervisor, paused = Supervisor(), threading.Event()
+
+    async def main() -> None:
+        with commands_from_start("run", RIG, supervisor, realtime=realtime) as commands:
+
+            def motion() -> bool:
+                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                for _ in range(100 * ENDS_WITHIN_S):
+                    if commands.board.read().stop:
+                        return True
+                    paused.wait(0.01)
+                return False
+
+            assert supervisor.during(commands.board, motion)
+            supervisor.finish()
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(main())
+    assert supervisor.interrupted
 
 
 #: A program at a question to its operator.
