@@ -258,7 +258,8 @@ def test_a_camera_that_is_not_there_is_missing_and_one_not_named_is_not_tried() 
 def with_two_cameras(tmp_path: Path) -> Path:
     """A rig whose second camera, `side`, has larger images."""
     document = load_rig(RIG).document
-    side = document.cameras[0].model_copy(update={"name": "side", "size_px": [1920, 1080]})
+    changes = {"name": "side", "width_px": 1920, "height_px": 1080}
+    side = document.cameras[0].model_copy(update=changes)
     document = document.model_copy(update={"cameras": [*document.cameras, side]})
     rig = tmp_path / "two.yaml"
     rig.write_text(document.model_dump_json(exclude_unset=True))
@@ -268,9 +269,9 @@ def with_two_cameras(tmp_path: Path) -> Path:
 def test_each_camera_is_judged_by_its_own_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened: list[str] = []
+    opened: list[int | str] = []
 
-    def capture(source: str) -> FakeCapture:
+    def capture(source: int | str) -> FakeCapture:
         opened.append(source)
         return FakeCapture()
 
@@ -295,7 +296,7 @@ def test_each_camera_is_judged_by_its_own_size(
         "camera front": True,
         "camera side": False,
     }
-    assert opened == ["0", "1", "0", "1"]
+    assert opened == [0, 1, 0, 1]
     untested = answers()
     assert "--camera side=INDEX tests it" in untested["camera side"][1]
     unknown = call("doctor", rig, "--camera", "rear=0")
