@@ -230,7 +230,7 @@ class Pose(ReadOnly):
         off = _deviation(self.rotation)
         if not off < _FOUR_DIGITS:
             raise BadInput(
-                "the matrix of a pose is no rotation",
+                "the matrix of a pose is not a rotation",
                 where="Pose(position, rotation)",
                 why="its rows are not of length 1, not at right angles, or mirrored",
                 next_step="compute it from a unit quaternion: Pose.from_quaternion(position, wxyz)",
