@@ -425,7 +425,7 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
     Raises:
         Refused: The planned drive positions there differ by more than the rig's start tolerance.
         TensionInfeasible: The cables cannot hold the platform there.
-        Fault: The cables hold the platform in no equilibrium.
+        Fault: The platform has no equilibrium at these positions.
     """
     winches = WinchMap(rig)
     unstrained = winches.unstrained_from_counts(counts)
