@@ -289,9 +289,9 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose, *, turns: b
         return
     if not np.isfinite(margin):
         raise BadInput(
-            f"at the {name} the cables cannot hold the platform, however hard they pull",
+            f"at the {name} the cables cannot hold the platform at any tension",
             where=f"scene {scene.name}",
-            why="they act in too few directions: the structure matrix has not full rank there",
+            why="they act in too few directions: the structure matrix is rank-deficient there",
             next_step=f"move the {name}, or change the rig's outlets and anchors",
         )
     values: dict[str, float | str] = {"margin_n": margin, "required_n": reserve}

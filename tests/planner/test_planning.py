@@ -261,9 +261,9 @@ def test_an_end_with_margin_for_a_plan_without_rotation_has_it_as_a_remedy(hall,
 def test_cables_that_act_in_too_few_directions_are_named(
     gachon, ready_scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    nothing = np.array([-np.inf])  # where the structure matrix has not full rank
+    nothing = np.array([-np.inf])  # where the structure matrix is rank-deficient
     monkeypatch.setattr("planner.endpoints.capacity_margins", lambda *_: nothing)
-    with pytest.raises(BadInput, match="however hard they pull") as caught:
+    with pytest.raises(BadInput, match="cannot hold the platform at any tension") as caught:
         require_usable_ends(gachon, ready_scene("environment_1"))
     assert "too few directions" in caught.value.why
 
