@@ -124,7 +124,7 @@ def _adapter_name(device: Path) -> str:
             f"two serial adapters have the serial number {names[-1]}",
             where="bus.channel",
             why=f"they are plugged into ports {usb.name} and {twin.name}; latched fault and homing"
-            " reference are filed under the serial number, so whose they are is unknown",
+            " reference are filed under the serial number, so it is unclear to which they belong",
             next_step="unplug one of them, or give it another serial number",
         )
     return " ".join(["usb", *names, *unit_of])
