@@ -254,8 +254,8 @@ def locked_within(handle: int, seconds: float, operation: int = fcntl.LOCK_EX) -
             time.sleep(_POLL_INTERVAL)
         except OSError as error:
             raise Refused(
-                "files of the state folder cannot be locked, so that another program could move"
-                " the same drives",
+                "files of the state folder cannot be locked, so another program could move the"
+                " same drives",
                 where=str(state_folders()[0]),
                 why=error.strerror or str(error),
                 next_step="create /var/lib/cdpr on a local disk (docs/commissioning.md), or set"
