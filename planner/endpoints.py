@@ -109,8 +109,8 @@ def _require_few_cables(rig: Rig) -> None:
         raise BadInput(
             f"{count} cables are too many to plan for; the largest number is {CABLES_MOST}",
             where=f"rig {rig.name}",
-            why=f"every five of them bound the forces and moments that all can give: there are"
-            f" {comb(count, 5)} such bounds at each of thousands of poses",
+            why=f"each set of five cables bounds the wrenches that all can produce:"
+            f" {comb(count, 5)} bounds at each of thousands of poses",
             next_step="plan with fewer cables, such as one where several pull in parallel",
             values={"cables": count, "cables_most": CABLES_MOST},
         )
