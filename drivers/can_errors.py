@@ -293,7 +293,7 @@ class TorqueLost(Refused):
             f"drive {node} held its cable before the set-up and is now in {state}",
             where=SETTING_UP,
             why="it removes its torque when it leaves the NMT state operational, or an error or its"
-            " safe torque off did so: the platform may have dropped",
+            " safe torque off removed it; the platform may have dropped",
             next_step="support the platform and press the emergency stop: each repeated command may"
             " release one more drive; drives that do this between two commands cannot be used;"
             " otherwise run `cdpr home`",
