@@ -134,8 +134,8 @@ def test_the_option_is_named_as_it_was_typed(
     ("text", "shown"),
     [
         (
-            "`budget=` and `rounds=` exclude each other",
-            "--budget-ms and --rounds exclude each other",
+            "`budget=` and `rounds=` contradict each other",
+            "--budget-ms and --rounds contradict each other",
         ),
         ("leave out `weights=`", "leave out --weight"),
         ("pass `planner='optimal'`", "pass --planner optimal"),

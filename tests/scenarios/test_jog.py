@@ -46,7 +46,7 @@ def test_a_jog_is_a_slow_straight_run_from_where_the_platform_is(tmp_path: Path)
         ((*BY, "--no-scene", "--scene", "scene.yaml"), 2, "obstacles are unknown"),
         ((*BY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
         (("--fast",), 2, "no motion given"),
-        (("--to-home", *BY), 2, "exclude each other"),
+        (("--to-home", *BY), 2, "contradict each other"),
         (("--to-home",), 2, "obstacles are unknown"),
         ((*BY, "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
     ],
