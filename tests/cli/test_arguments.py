@@ -329,7 +329,7 @@ def test_another_camera_without_a_source_is_not_the_current_folder(
     with nothing_written(folder):
         answer = call(*words, "--beside", beside)
     one_message(answer, 2)
-    assert "source" in answer.said or "no camera ''" in answer.said
+    assert "source" in answer.said or "unknown camera ''" in answer.said
 
 
 SECRET = "s3cret"
