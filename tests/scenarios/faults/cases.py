@@ -14,7 +14,6 @@ from drivers.cia402.pdo import (
     SDO_REQUEST_BASE,
     SYNC_ID,
     TPDO1_BASE,
-    make_reply,
     make_set_point,
     parse_reply,
 )
@@ -24,6 +23,7 @@ from executor.safety.stall import STUCK_CYCLES
 from executor.state_machine import State
 from simulation.drives.behaviour import STRICT, DriveBehaviour, behaviour_named
 from simulation.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
+from tests.drivers.drive_bench import make_reply
 from tests.scenarios.faults.bench import EVERY_ID, Bench, Script, SimulatedBench, a_message, once
 from tests.scenarios.faults.samples import emergencies, left_holding
 
