@@ -19,7 +19,6 @@ from pydantic import ValidationError
 
 from executor.recording.checksums import REBUILT, require_unchanged
 from executor.recording.clearance import ClearanceTable
-from executor.recording.csv_columns import TableFile
 from executor.recording.record_files import (
     AGAIN,
     RunCourse,
@@ -28,6 +27,7 @@ from executor.recording.record_files import (
     read_summary,
     whole_lines,
 )
+from executor.recording.table_files import TableFile
 from executor.recording.tables import CycleTable, FusedTable, PoseTable
 from model.errors import BadInput, Fault, InvalidFile
 from model.files.documents import write_atomic
