@@ -18,7 +18,7 @@ from drivers.cia402.pdo import (
     parse_reply,
 )
 from drivers.cia402.state_machine import ControlWord, DriveState
-from executor.safety.monitor import WatchLimits
+from executor.safety.monitor import MonitorLimits
 from executor.safety.stall import STUCK_CYCLES
 from executor.state_machine import State
 from simulation.drives.behaviour import STRICT, DriveBehaviour, behaviour_named
@@ -281,7 +281,7 @@ REPORTED_BY_DRIVE = 3.0
 BELIEVED = 2.0
 """Cycles after a jump that the reply at its SYNC shows: the next one confirms it, then the stop."""
 
-MAY_BE_LATE = WatchLimits(0.0, 0.0, 0.0, 0.0).late_periods
+MAY_BE_LATE = MonitorLimits(0.0, 0.0, 0.0, 0.0).late_periods
 """Lateness that ends no run; a stop that waits for such a cycle is as late."""
 
 
