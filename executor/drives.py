@@ -24,7 +24,7 @@ from drivers.factory import (
     read_drives,
     stop_alone,
 )
-from executor.control.preconditions import counted_here, require_below, set_up_here
+from executor.control.preconditions import configuration_at_rest, require_below, with_counts_at
 from executor.control.standstill import is_braked
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
@@ -306,7 +306,7 @@ def unreferenced_drives_of(
 
     def configure_as(snapshot: DriveSnapshot) -> tuple[Rig, float]:
         require_below(rig, snapshot, limit)
-        return counted_here(rig, snapshot.positions.tolist(), about), limit
+        return with_counts_at(rig, snapshot.positions.tolist(), about), limit
 
     load = empty_scene(rig).load
     return open_drives(
@@ -325,7 +325,7 @@ def resting_drives_of(
     """
     rig = rig_from_document(document)
     load = empty_scene(rig).load
-    configure_as = partial(set_up_here, rig)
+    configure_as = partial(configuration_at_rest, rig)
     return open_drives(rig, rig.home, load, to_reset=to_reset, configure_as=configure_as)
 
 
