@@ -56,7 +56,7 @@ def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -
 _STEPS = (0.02, 0.01, 0.005, 0.002)
 
 
-def drawn_tight(path: Array, is_free: IsFree, cost: Cost) -> Array:
+def pull_tight(path: Array, is_free: IsFree, cost: Cost) -> Array:
     """Moves corners, one coordinate direction at a time, while the path gets cheaper.
 
     Args:
@@ -166,7 +166,7 @@ def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost)
     length = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
     for _ in range(_ROUNDS):
         path = cheapest_through(path, planner.edge, cost, length / _SPREAD_POINTS)
-        path = drawn_tight(path, planner.edge, cost)
+        path = pull_tight(path, planner.edge, cost)
     return planner.shortcut(path, _FOR_FEWER_CORNERS)
 
 
