@@ -63,7 +63,7 @@ def _declared(drives: Capabilities) -> str:
     return "" if drives.sync else " (winches[].brake of all, and drives.watchdog_ms)"
 
 
-def require_unchanged(checked: CheckedSetpoints) -> None:
+def require_checked(checked: CheckedSetpoints) -> None:
     """Requires the set-points to be those that were checked.
 
     Raises:

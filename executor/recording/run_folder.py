@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from executor.recording.checksums import REBUILT, require_unchanged
+from executor.recording.checksums import REBUILT, require_unchanged_files
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import (
     AGAIN,
@@ -124,7 +124,7 @@ class RunFolder:
         if not (os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK)):
             then = "give a folder that `cdpr run -o` created and that you may read"
             raise BadInput("no such run folder", where=str(path), next_step=then)
-        require_unchanged(path)
+        require_unchanged_files(path)
         if missing := cls(path)._missing(NEEDED):
             raise cls(path)._incomplete(missing)
         return cls(path)
@@ -140,7 +140,7 @@ class RunFolder:
         folder = cls(path)
         if folder.is_whole or folder._missing(BEGUN):
             return cls.open(path)  # ended, or raises with what is missing
-        require_unchanged(path)
+        require_unchanged_files(path)
         if folder._lost() or folder.is_active():
             raise folder._incomplete(folder._lost())
         return folder
