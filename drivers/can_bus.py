@@ -23,7 +23,7 @@ import can
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.can_errors import bus_fault, bus_name
+from drivers.can_errors import bus_fault, bus_text
 from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
 
@@ -358,7 +358,7 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
     try:
         bus.send(message)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise bus_fault("a frame could not be sent", bus_name(bus), error) from error
+        raise bus_fault("a frame could not be sent", bus_text(bus), error) from error
 
 
 def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
@@ -370,7 +370,7 @@ def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
     try:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
+        raise bus_fault("the bus cannot be read", bus_text(bus), error) from error
 
 
 # CAN interfaces of Linux: state, bit rate, queue, state of the controller.

@@ -109,7 +109,7 @@ def before_motion() -> Iterator[None]:
         raise
 
 
-def bus_name(bus: can.BusABC) -> str:
+def bus_text(bus: can.BusABC) -> str:
     """Name of the bus for messages."""
     return f"bus {bus.channel_info}"
 
@@ -216,7 +216,7 @@ def error_frame_fault(bus: can.BusABC, frame: can.Message) -> BusFault | None:
     """
     if not isinstance(bus, WITH_CLASSES):
         return None
-    identifier, data, where = frame.arbitration_id, frame.data, bus_name(bus)
+    identifier, data, where = frame.arbitration_id, frame.data, bus_text(bus)
     if identifier & ErrorClass.BUS_OFF:
         return BusOff("the controller went bus-off", where)
     if not identifier & ErrorClass.CONTROLLER or len(data) < 2:
@@ -255,7 +255,7 @@ class ErrorFrames:
         if self._in_a_row < ERROR_CYCLES:
             return None
         what = f"error frames in {self._in_a_row} cycles in a row, {self.total} in all"
-        return BusErrors(what, bus_name(self._bus), {"error_frames": self.total})
+        return BusErrors(what, bus_text(self._bus), {"error_frames": self.total})
 
 
 # Refusals of the configuration, independent of the protocol.
