@@ -106,7 +106,9 @@ def plan(
     require_unaltered(rig, scene)
     require_types(*((pose, Pose) for pose in via), optional=((start, Pose), (goal, Pose)))
     if from_run is not None and start is not None:
-        raise BadInput("from_run and start contradict each other", next_step="leave out one")
+        raise BadInput(
+            "from_run and start contradict each other", next_step="leave out one of them"
+        )
     of_legs: list[Any] = []
     if rounds is not None:
         several = np.iterable(rounds) and not isinstance(rounds, str)

@@ -20,7 +20,7 @@ from can.interfaces.pcan.pcan import PCAN_BITRATES
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
-from drivers.can_errors import bus_fault, bus_name
+from drivers.can_errors import bus_fault, bus_text
 from drivers.can_interfaces import bring_up, require_usable
 from model.errors import BadInput, HardwareMissing
 from model.rig import Rig
@@ -297,7 +297,7 @@ def transmit(bus: can.BusABC, message: can.Message) -> None:
     try:
         bus.send(message)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise bus_fault("a frame could not be sent", bus_name(bus), error) from error
+        raise bus_fault("a frame could not be sent", bus_text(bus), error) from error
 
 
 def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
@@ -309,4 +309,4 @@ def receive_frame(bus: can.BusABC, timeout: float) -> can.Message | None:
     try:
         return bus.recv(timeout)
     except Exception as error:  # back ends raise errors of their own libraries
-        raise bus_fault("the bus cannot be read", bus_name(bus), error) from error
+        raise bus_fault("the bus cannot be read", bus_text(bus), error) from error

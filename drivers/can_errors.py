@@ -112,7 +112,7 @@ def before_motion() -> Iterator[None]:
         raise
 
 
-def bus_name(bus: can.BusABC) -> str:
+def bus_text(bus: can.BusABC) -> str:
     """Name of the bus for messages."""
     return f"bus {bus.channel_info}"
 
@@ -220,7 +220,7 @@ def error_frame_fault(bus: can.BusABC, frame: can.Message) -> BusFault | None:
     """
     if not isinstance(bus, WITH_CLASSES):
         return None
-    identifier, data, where = frame.arbitration_id, frame.data, bus_name(bus)
+    identifier, data, where = frame.arbitration_id, frame.data, bus_text(bus)
     if identifier & ErrorClass.BUS_OFF:
         return BusOff("the controller went bus-off", where)
     if not identifier & ErrorClass.CONTROLLER or len(data) < 2:
@@ -265,7 +265,7 @@ class ErrorFrames:
         if self._in_a_row < ERROR_CYCLES:
             return None
         what = f"error frames in {self._in_a_row} cycles in a row, {self.total} in all"
-        return BusErrors(what, bus_name(self._bus), {"error_frames": self.total})
+        return BusErrors(what, bus_text(self._bus), {"error_frames": self.total})
 
 
 # Refusals of the configuration, independent of the protocol.
@@ -303,7 +303,7 @@ class TorqueLost(Refused):
             f"drive {node} held its cable before the set-up and is now in {state}",
             where=SETTING_UP,
             why="it removes its torque when it leaves the NMT state operational, or an error or its"
-            " safe torque off did so: the platform may have dropped",
+            " safe torque off removed it; the platform may have dropped",
             next_step="support the platform and press the emergency stop: each repeated command may"
             " release one more drive; drives that do this between two commands cannot be used;"
             " otherwise run `cdpr home`",

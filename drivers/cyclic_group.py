@@ -22,7 +22,7 @@ from drivers.can_errors import (
     ErrorFrames,
     ForeignMaster,
     ReceiveOverflow,
-    bus_name,
+    bus_text,
 )
 from drivers.can_load import check_bus_load
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
@@ -73,7 +73,7 @@ class CyclicBus:
             is_command: Whether a frame with one of the identifiers commands, by its data; drives
                 and harmless requests may share an identifier with a command.
         """
-        self._bus, self._where = bus, bus_name(bus)
+        self._bus, self._where = bus, bus_text(bus)
         self._own = EchoFilter(commanding, echoes_own_frames=echoes_own_frames(bus))
         self._foreign_master_message, self._is_command = foreign_master_message, is_command
         self._errors = ErrorFrames(bus)

@@ -24,7 +24,7 @@ from drivers.factory import (
     read_drives,
     stop_alone,
 )
-from executor.control.preconditions import counted_here, require_below, set_up_here
+from executor.control.preconditions import configuration_at_rest, require_below, with_counts_at
 from executor.control.standstill import is_braked
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock
@@ -308,7 +308,7 @@ def unreferenced_drives_of(
 
     def configure_as(snapshot: DriveSnapshot) -> tuple[Rig, float]:
         require_below(rig, snapshot, limit)
-        return counted_here(rig, snapshot.positions.tolist(), about), limit
+        return with_counts_at(rig, snapshot.positions.tolist(), about), limit
 
     load = empty_scene(rig).load
     return open_drives(
@@ -327,7 +327,7 @@ def resting_drives_of(
     """
     rig = rig_from_document(document)
     load = empty_scene(rig).load
-    configure_as = partial(set_up_here, rig)
+    configure_as = partial(configuration_at_rest, rig)
     return open_drives(rig, rig.home, load, to_reset=to_reset, configure_as=configure_as)
 
 
@@ -427,7 +427,7 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
     Raises:
         Refused: The planned drive positions there differ by more than the rig's start tolerance.
         TensionInfeasible: The cables cannot hold the platform there.
-        Fault: The cables hold the platform in no equilibrium.
+        Fault: The platform has no equilibrium at these positions.
     """
     winches = WinchMap(rig)
     unstrained = winches.unstrained_from_counts(counts)

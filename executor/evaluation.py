@@ -146,7 +146,7 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
         if plan.scene.obstacles and np.isfinite(poses.position).any():
             if any((folder.path / name).is_file() for name in (SUMMARY, CHECKSUMS)):
                 raise BadInput(
-                    f"{CLEARANCE} is missing and cannot be made again",
+                    f"{CLEARANCE} is missing and cannot be recomputed",
                     where=str(folder.path),
                     why="no other table holds the clearance that the cameras measured",
                     next_step=AGAIN,

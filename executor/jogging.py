@@ -194,9 +194,9 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
     """
     if by is not None and to_home:
         raise BadInput(
-            "`by=` and `to_home=` exclude each other",
+            "`by=` and `to_home=` contradict each other",
             where="cdpr jog",
-            next_step="leave one of them out",
+            next_step="leave out one of them",
         )
     if by is None and not to_home:
         raise BadInput(

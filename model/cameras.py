@@ -99,7 +99,8 @@ class Camera(ReadOnly):
                 f"the image has to be rotated by 90° for camera {self.name!r}, which cannot be"
                 " combined with readout_ms",
                 where=where,
-                why="rows of the sensor are columns of that image, so it has no time per row",
+                why="the sensor's rows are columns of that image, so its rows have no single"
+                " exposure time",
                 next_step="remove the orientation from the files (of images EXIF, of videos the"
                 " rotation) and calibrate again, or record in landscape",
             )

@@ -217,7 +217,8 @@ class Pose(ReadOnly):
         object.__setattr__(self, "rotation", _floats(self.rotation, "rotation"))
         if self.position.shape != (3,) or self.rotation.shape != (3, 3):
             raise BadInput(
-                f"a pose of shapes {self.position.shape} and {self.rotation.shape}",
+                f"position and rotation of a pose have shapes {self.position.shape} and"
+                f" {self.rotation.shape}, not (3,) and (3, 3)",
                 where="Pose(position, rotation)",
                 next_step="pass a position of shape (3,) [m] and a rotation of shape (3, 3)",
             )
@@ -230,7 +231,7 @@ class Pose(ReadOnly):
         off = _deviation(self.rotation)
         if not off < _FOUR_DIGITS:
             raise BadInput(
-                "the matrix of a pose is no rotation",
+                "the matrix of a pose is not a rotation",
                 where="Pose(position, rotation)",
                 why="its rows are not of length 1, not at right angles, or mirrored",
                 next_step="compute it from a unit quaternion: Pose.from_quaternion(position, wxyz)",

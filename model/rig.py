@@ -260,7 +260,9 @@ class Rig(ReadOnly):
             return self.cameras[0]
         if name not in names:
             raise BadInput(
-                f"no camera {name!r}", where=self.name, next_step=f"name one of: {', '.join(names)}"
+                f"unknown camera {name!r}",
+                where=self.name,
+                next_step=f"name one of: {', '.join(names)}",
             )
         return self.cameras[names.index(name)]
 

@@ -368,7 +368,7 @@ _HOW_TO_CHANGE = {
 }
 
 
-class Documented(Protocol):
+class HasDocument(Protocol):
     """A rig, a scene or a plan."""
 
     def remade(self) -> object:
@@ -376,7 +376,7 @@ class Documented(Protocol):
         ...
 
 
-def require_unaltered(*things: Documented | None) -> None:
+def require_unaltered(*things: HasDocument | None) -> None:
     """Refuses copies with other fields than their documents, as `dataclasses.replace` makes them.
 
     Hashes, files and the process of the drives come from the document.

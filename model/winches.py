@@ -148,7 +148,7 @@ class WinchMap:
             else:
                 return pose
         raise Fault(
-            "cables of these lengths hold the platform in no equilibrium",
+            "the platform has no equilibrium at these cable lengths",
             where="drive positions",
             why="the homing reference is lost, a cable slipped, or the rig file is wrong",
             next_step="home the drives at a known pose; nothing was moved",

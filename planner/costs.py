@@ -3,6 +3,9 @@
 The kinematic cost of a pose is c = γ_d + γ_f: the condition number of the structure matrix and the
 inverse volume of the force set, each scaled to 0..1 between its extremes over the workspace
 (paper, Eqs. 4, 5, 8 and section 3.2; see docs/paper.md for the corrections).
+
+The objectives, with the weights of clearance and capacity, are in `planner.settings`; the optimal
+planner evaluates them in `planner.anytime.problem` and `planner.anytime_6d.problem`.
 """
 
 from __future__ import annotations

@@ -109,8 +109,8 @@ def _require_few_cables(rig: Rig) -> None:
         raise BadInput(
             f"{count} cables are too many to plan for; the largest number is {CABLES_MOST}",
             where=f"rig {rig.name}",
-            why=f"every five of them bound the forces and moments that all can give: there are"
-            f" {comb(count, 5)} such bounds at each of thousands of poses",
+            why=f"each set of five cables bounds the wrenches that all can produce:"
+            f" {comb(count, 5)} bounds at each of thousands of poses",
             next_step="plan with fewer cables, such as one where several pull in parallel",
             values={"cables": count, "cables_most": CABLES_MOST},
         )
@@ -289,9 +289,9 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose, *, turns: b
         return
     if not np.isfinite(margin):
         raise BadInput(
-            f"at the {name} the cables cannot hold the platform, however hard they pull",
+            f"at the {name} the cables cannot hold the platform at any tension",
             where=f"scene {scene.name}",
-            why="they act in too few directions: the structure matrix has not full rank there",
+            why="they act in too few directions: the structure matrix is rank-deficient there",
             next_step=f"move the {name}, or change the rig's outlets and anchors",
         )
     values: dict[str, float | str] = {"margin_n": margin, "required_n": reserve}

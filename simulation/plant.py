@@ -379,7 +379,7 @@ class Plant:
         return Fault(
             f"the simulation failed: {what}",
             where=f"plant of rig {self._rig.name}",
-            why="the cables were paid out or wound in to lengths of no platform pose: "
+            why="no platform pose fits the commanded cable lengths: "
             + ", ".join(f"{length:.3f}" for length in unstrained)
             + " m",
             next_step="check the commands sent to the drives",

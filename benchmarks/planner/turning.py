@@ -24,7 +24,7 @@ from planner.anytime_6d.problem import (
     matrix_of,
     move_allowed,
     put_rotated,
-    turn_between,
+    rotation_between,
 )
 from planner.collision.rotating_edges import rotating_edge_free
 from planner.collision.world import self_rotating_edge_free
@@ -81,7 +81,7 @@ def edges(problem: RotatingProblem) -> None:
     """Prints the times of the parts of the proof of one allowed move."""
     moves = allowed_moves(problem, 60)
     given = [
-        (a[:3], b[:3], matrix_of(a), np.array(turn_between(a, b))) for a, b in moves
+        (a[:3], b[:3], matrix_of(a), np.array(rotation_between(a, b))) for a, b in moves
     ]  # what each check reads
     tallies = np.zeros(6, dtype=np.int64)
     world, robot, load, reserve = problem.world, problem.robot, problem.load, problem.reserve

@@ -53,7 +53,7 @@ def checked_deviations(given: Mapping[str, float]) -> dict[str, float]:
     unknown = [group for group in given if group not in _GROUPS]
     if unknown:
         raise BadInput(
-            f"no parameter group {unknown[0]!r}", next_step=f"name some of: {', '.join(_GROUPS)}"
+            f"unknown parameter group {unknown[0]!r}", next_step=f"use any of: {', '.join(_GROUPS)}"
         )
     return {group: positive_number(f"deviation of {group}", x) for group, x in given.items()}
 

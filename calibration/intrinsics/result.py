@@ -347,7 +347,7 @@ def camera_named(rig: RigDocument, name: str) -> CameraDocument:
             return camera
     names = ", ".join(camera.name for camera in rig.cameras) or "none"
     raise BadInput(
-        f"no camera {name!r}",
+        f"unknown camera {name!r}",
         where=f"rig {rig.name}",
         why=f"the rig's cameras: {names}",
         next_step="name one of them, or add the camera to the rig file",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from cdpr.console.commands import PageControl, Seen
-from cdpr.console.view import measured_data
+from cdpr.console.view import measured_view
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
@@ -262,7 +262,7 @@ def measured_state(status: dict[str, Any] | None, age: float) -> dict[str, Any] 
     measured = None if status is None else status["measured"]
     if status is None or measured is None or status["elapsed_s"] is None:
         return None
-    return measured_data(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
+    return measured_view(measured, max(0.0, status["elapsed_s"] - measured["time_s"]) + age)
 
 
 # States in transit to the pages.

@@ -93,7 +93,7 @@ def nearest_data(nearest: Nearest, required: float) -> dict[str, Any]:
     }
 
 
-def measured_data(measured: dict[str, Any], age: float) -> dict[str, Any]:
+def measured_view(measured: dict[str, Any], age: float) -> dict[str, Any]:
     """The measured pose of a run's status and its 95 % ellipsoid, in mm for the page.
 
     Args:

@@ -217,7 +217,7 @@ USED_FOR = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RobotSeen:
+class RobotReport:
     """What is known of the robot; tensions may be known without a pose.
 
     Attributes:
@@ -261,12 +261,12 @@ class RobotWatch:
         self._lock = threading.Lock()
         self._answer: Future[StatusResult] | None = None
         self._due = 0.0  # when to read the drives, on the monotonic clock; at the start
-        self.now = RobotSeen(None, None, why_not="the drives have not been read yet")
+        self.now = RobotReport(None, None, why_not="the drives have not been read yet")
 
     def simulate_at(self, pose: Pose) -> None:
         """Places the robot where simulated drives start."""
         robot = self._view.simulated_at(pose)
-        self.now = RobotSeen(robot, [round(tension, 2) for tension in robot.tensions])
+        self.now = RobotReport(robot, [round(tension, 2) for tension in robot.tensions])
 
     def ask(self) -> None:
         """Requests a reading of the drives, at rest."""
@@ -321,7 +321,7 @@ class RobotWatch:
             robot = self._view.take(status)
             why_not = None if robot else "the cables fit no pose; some may be slack"
             tensions = [cable_tension(drive) for drive in status["drives"]]
-            self.now = RobotSeen(robot, tensions, why_not=why_not)
+            self.now = RobotReport(robot, tensions, why_not=why_not)
         elif self._read is not None:
             with self._lock:
                 if self.now.at is None and self.now.tensions is not None:
@@ -343,9 +343,9 @@ class RobotWatch:
             if result.missing is not None:
                 raise result.missing
         except CdprError as error:
-            seen = RobotSeen(None, None, _local_time(), error.what)
+            seen = RobotReport(None, None, _local_time(), error.what)
         except Exception as error:  # such as an adapter that was unplugged
-            seen = RobotSeen(None, None, _local_time(), f"{type(error).__name__}: {error}")
+            seen = RobotReport(None, None, _local_time(), f"{type(error).__name__}: {error}")
         else:
             if result.drives is None:
                 self._due = time.monotonic() + USED_FOR
@@ -356,7 +356,7 @@ class RobotWatch:
                     round(drive.tension, 2) if drive.has_torque else None for drive in result.drives
                 ]
                 robot = self._view.at_rest(result)
-                seen = RobotSeen(robot, tensions, _local_time(), why_not)
+                seen = RobotReport(robot, tensions, _local_time(), why_not)
         with self._lock:
             self.now = seen
 

@@ -82,17 +82,8 @@ def parse_set_point(data: bytes | bytearray) -> tuple[int, int] | None:
     return _RPDO1.unpack(data) if len(data) == _RPDO1.size else None
 
 
-def make_reply(status_word: int, position: int, torque: int) -> bytes:
-    """TPDO1: 6041h status word, 6064h position actual [counts], 6077h torque [per mille].
-
-    Raises:
-        struct.error: A value does not fit its object.
-    """
-    return _TPDO1.pack(status_word, position, torque)
-
-
 def parse_reply(data: bytes | bytearray) -> Reply | None:
-    """A TPDO1; None if the length is wrong."""
+    """TPDO1: 6041h, 6064h and 6077h as a `Reply`; None if the length is wrong."""
     return Reply(*_TPDO1.unpack(data)) if len(data) == _TPDO1.size else None
 
 

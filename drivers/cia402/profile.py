@@ -51,7 +51,7 @@ def load_profile(name: str) -> ProfileDocument:
     path = Path(name)
     if path.suffix not in (".yaml", ".yml"):
         raise BadInput(
-            f"there is no drive profile {name!r}",
+            f"unknown drive profile {name!r}",
             where="drives.profile",
             next_step=f"use one of {', '.join(profile_names())}, or the path of your own YAML file",
         )

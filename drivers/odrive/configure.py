@@ -20,7 +20,7 @@ from drivers.can_errors import (
     EchoFilter,
     ForeignMaster,
     answers_twice,
-    bus_name,
+    bus_text,
     error_frame_fault,
     in_fault,
     moved_by_another,
@@ -136,7 +136,7 @@ class SetupLink:
                     identifier = message.arbitration_id
                     if is_command(identifier, message.data) and self._own.is_foreign(identifier):
                         text = foreign_master_message(identifier, message.data)
-                        raise ForeignMaster(text, bus_name(self._bus))
+                        raise ForeignMaster(text, bus_text(self._bus))
                     yield message
                 if left > 0.0:
                     break

@@ -270,7 +270,8 @@ def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
         raise BadInput(
             "`realtime=False` needs synthetic cameras",
             where=f"`cameras={real[0]}`",
-            why="a real camera takes images in real time; a fast run would end before",
+            why="a real camera takes images in real time; a fast run would end before the"
+            " first one",
             next_step="leave out `realtime=False`, or pass `cameras='synthetic'`",
         )
 

@@ -12,7 +12,7 @@ from drivers.drive_group import CycleStatus, GroupState
 from executor.control.sync_master import SyncMaster
 from executor.safety.fault_messages import Alarm, StopReaction
 from executor.safety.gate import ALLOWED, GateDecision, Purpose, Request, examine
-from executor.safety.limits import gate_limits, stuck_limits, watch_limits
+from executor.safety.limits import gate_limits, monitor_limits, stuck_limits
 from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckWatch
 from executor.trajectory.setpoints import CheckedSetpoints
@@ -178,14 +178,14 @@ class Cycle:
     def __init__(
         self, checked: CheckedSetpoints, master: SyncMaster, *, slack_counts: bool = True
     ) -> None:
-        """Sends nothing yet; ``slack_counts`` as for `watch_limits`."""
+        """Sends nothing yet; ``slack_counts`` as for `monitor_limits`."""
         rig = checked.rig
         self._rig, self._master, self._group = rig, master, master.group
         self._per_metre = np.array([w.counts_per_metre for w in rig.winches])
         self._limits = gate_limits(rig, checked.setpoints, checked.cycle)
         names = tuple(rig.drive_names.values())
         self._numbers = {node: k for k, node in enumerate(rig.drive_names, start=1)}
-        limits = watch_limits(rig, master.rule, slack_counts=slack_counts)
+        limits = monitor_limits(rig, master.rule, slack_counts=slack_counts)
         self._watch = Monitor.fresh(limits, names)
         self._stuck = StuckWatch.fresh(stuck_limits(rig, checked.cycle), names)
         self.armed = False

@@ -16,7 +16,7 @@ from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from drivers.factory import may_have_released, stop_alone, without_torque
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
-from executor.control.preconditions import require_at_start, require_capabilities, require_unchanged
+from executor.control.preconditions import require_at_start, require_capabilities, require_checked
 from executor.control.sync_master import SyncMaster, changed_states
 from executor.safety.fault_messages import Alarm, AlarmHistory, StopReaction, shared_causes
 from executor.safety.gate import Purpose
@@ -85,7 +85,7 @@ class Loop:
             HardwareMissing: A drive does not answer.
         """
         require_capabilities(self._group.capabilities, self._checked.cycle)
-        require_unchanged(self._checked)
+        require_checked(self._checked)
         seen = self._master.read_positions()
         self._master.require_no_fault()
         require(seen)

@@ -63,7 +63,7 @@ def _declared(drives: Capabilities) -> str:
     return "" if drives.sync else " (winches[].brake of all, and drives.watchdog_ms)"
 
 
-def require_unchanged(checked: CheckedSetpoints) -> None:
+def require_checked(checked: CheckedSetpoints) -> None:
     """Requires the set-points to be those that were checked.
 
     Raises:
@@ -161,7 +161,7 @@ def _lost(rig: Rig, drive: int, how: str) -> Refused:
 # Unreferenced drives: the rig they are configured and monitored as.
 
 
-def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
+def with_counts_at(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
     """The rig that unreferenced drives are configured for, with counts from a guessed pose.
 
     Args:
@@ -182,7 +182,7 @@ def counted_here(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
     return rig_from_document(rig.document.model_copy(update={"winches": winches_here}))
 
 
-def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
+def configuration_at_rest(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
     """Configuration of drives that will not move: limits centred on their positions.
 
     The rig file's counts do not apply: a drive enabled beyond its position limits runs to them.
@@ -192,9 +192,9 @@ def set_up_here(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float]:
         snapshot: Positions of its drives.
 
     Returns:
-        The rig, see `counted_here`, and the largest tension, [N].
+        The rig, see `with_counts_at`, and the largest tension, [N].
     """
-    return counted_here(rig, snapshot.positions.tolist(), rig.home), rig.max_tension
+    return with_counts_at(rig, snapshot.positions.tolist(), rig.home), rig.max_tension
 
 
 def with_reduced_limits(rig: Rig, *, limit: float, speed: float) -> Rig:

@@ -162,7 +162,7 @@ class FaultLatch:
         """
         if shown is not None and shown.rig not in (rig, _UNKNOWN):
             raise Refused(
-                f"the fault is of rig {shown.rig!r}, not of {rig!r}",
+                f"the latched fault belongs to rig {shown.rig!r}, not to {rig!r}",
                 where=f"bus {self._bus}",
                 why="its drives are not all known here, and would not be checked",
                 next_step=f"run `cdpr reset` with the rig file of {shown.rig!r}; if it was"
@@ -170,7 +170,7 @@ class FaultLatch:
             )
         if shown is not None and (unknown := self._unknown_nodes(shown)):
             raise Refused(
-                f"the fault is also of drives that are not in the rig file: node"
+                f"the latched fault also concerns drives that are not in the rig file: node"
                 f" {', '.join(map(str, unknown))}",
                 where=f"bus {self._bus}",
                 why="they would not be checked",

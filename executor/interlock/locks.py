@@ -124,7 +124,7 @@ def _adapter_name(device: Path) -> str:
             f"two serial adapters have the serial number {names[-1]}",
             where="bus.channel",
             why=f"they are plugged into ports {usb.name} and {twin.name}; latched fault and homing"
-            " reference are filed under the serial number, so whose they are is unknown",
+            " reference are filed under the serial number, so it is unclear to which they belong",
             next_step="unplug one of them, or give it another serial number",
         )
     return " ".join(["usb", *names, *unit_of])
@@ -254,8 +254,8 @@ def locked_within(handle: int, seconds: float, operation: int = fcntl.LOCK_EX) -
             time.sleep(_POLL_INTERVAL)
         except OSError as error:
             raise Refused(
-                "files of the state folder cannot be locked, so that another program could move"
-                " the same drives",
+                "files of the state folder cannot be locked, so another program could move the"
+                " same drives",
                 where=str(state_folders()[0]),
                 why=error.strerror or str(error),
                 next_step="create /var/lib/cdpr on a local disk (docs/commissioning.md), or set"

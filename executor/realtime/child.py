@@ -242,7 +242,7 @@ class Go:
     """Command of the supervisor to move."""
 
 
-class Gone:
+class SupervisorGone:
     """The supervisor withdrew, or is gone."""
 
 
@@ -327,8 +327,8 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
 
 
 def _poll(link: Connection) -> object:
-    """Next message of the supervisor, Gone if its link is closed, None if there is none."""
-    return (_receive(link) or Gone()) if link.poll() else None
+    """Next message of the supervisor or `SupervisorGone`; None if there is none."""
+    return (_receive(link) or SupervisorGone()) if link.poll() else None
 
 
 def _receive(link: Connection) -> object:

@@ -40,7 +40,7 @@ def write_checksums(folder: Path, names: Iterable[str]) -> None:
     write_atomic(folder / CHECKSUMS, "".join(lines))
 
 
-def require_unchanged(folder: Path) -> None:
+def require_unchanged_files(folder: Path) -> None:
     """Requires the files of a run to be as they were written; any of `REBUILT` may be missing.
 
     Raises:

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.csv_columns import (
+from executor.recording.table_files import (
     Column,
     Columns,
     Table,

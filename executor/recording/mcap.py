@@ -12,7 +12,6 @@ from foxglove.messages import CompressedImage, Log, LogLevel, Timestamp
 from mcap.writer import Writer
 
 from executor.recording.clearance import ClearanceTable, camera_of
-from executor.recording.csv_columns import Column
 from executor.recording.mcap_channels import (
     DRIVES,
     OWN,
@@ -31,6 +30,7 @@ from executor.recording.mcap_channels import (
     values_of,
 )
 from executor.recording.run_folder import PLAN, RIG, RunFolder
+from executor.recording.table_files import Column
 from executor.recording.tables import OK, CycleTable, FusedTable, PoseTable
 from executor.recording.verdict import RunContext, faults_among
 from model.errors import Fault

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from foxglove import messages as fox
 
-from executor.recording.csv_columns import Integers
+from executor.recording.table_files import Integers
 from executor.recording.tables import CycleTable
 from executor.recording.verdict import RunContext
 from model.cameras import Camera

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from drivers.factory import cycles_until_reported
-from executor.recording.csv_columns import Integers
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.table_files import Integers
 from executor.recording.tables import CycleTable, quaternions_of
 from executor.remote.status import RunStatus
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.checksums import REBUILT, require_unchanged
+from executor.recording.checksums import REBUILT, require_unchanged_files
 from executor.recording.clearance import ClearanceTable
-from executor.recording.csv_columns import TableFile
 from executor.recording.record_files import (
     AGAIN,
     RunCourse,
@@ -28,6 +27,7 @@ from executor.recording.record_files import (
     read_record,
     whole_lines,
 )
+from executor.recording.table_files import TableFile
 from executor.recording.tables import CycleTable, FusedTable, PoseTable
 from model.errors import BadInput, Fault
 from model.files.documents import write_atomic
@@ -123,7 +123,7 @@ class RunFolder:
         if not (os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK)):
             then = "give a folder that `cdpr run -o` created and that you may read"
             raise BadInput("no such run folder", where=str(path), next_step=then)
-        require_unchanged(path)
+        require_unchanged_files(path)
         if missing := cls(path)._missing(NEEDED):
             raise cls(path)._incomplete(missing)
         return cls(path)
@@ -139,7 +139,7 @@ class RunFolder:
         folder = cls(path)
         if folder.is_whole or folder._missing(BEGUN):
             return cls.open(path)  # ended, or raises with what is missing
-        require_unchanged(path)
+        require_unchanged_files(path)
         if folder._lost() or folder.is_active():
             raise folder._incomplete(folder._lost())
         return folder

@@ -1,4 +1,7 @@
-"""Tables of a run: one row per cycle of the loop, one row per image of the cameras."""
+"""Tables of a run: one row per cycle of the loop, one row per image of the cameras.
+
+A new column of ``cycles.csv`` is a field of `CycleTable`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from typing import Annotated
 
 import numpy as np
 
-from executor.recording.csv_columns import (
+from executor.recording.table_files import (
     Column,
     Columns,
     Integers,

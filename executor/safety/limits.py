@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from executor.safety.gate import Limits
-from executor.safety.monitor import WatchLimits
+from executor.safety.monitor import MonitorLimits
 from executor.safety.stall import StuckLimits
 from executor.safety.sync_timeout import SyncAge
 from model.rig import Rig
@@ -32,7 +32,7 @@ def tension_limits(rig: Rig) -> tuple[float, float]:
     return SLACK_SHARE * rig.min_tension, OVERLOAD_SHARE * rig.max_tension
 
 
-def watch_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) -> WatchLimits:
+def monitor_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) -> MonitorLimits:
     """Limits of the monitor.
 
     Args:
@@ -41,7 +41,7 @@ def watch_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) -> W
         slack_counts: Whether a slack cable is a fault; otherwise only a tension of NaN is.
     """
     low, high = tension_limits(rig)
-    return WatchLimits(
+    return MonitorLimits(
         following_error=rig.motion.following_error,
         min_tension=low if slack_counts else -math.inf,
         max_tension=high,

@@ -14,7 +14,7 @@ MISSING_CYCLES = 2
 
 
 @dataclass(frozen=True, slots=True)
-class WatchLimits:
+class MonitorLimits:
     """Limits of the monitor.
 
     Attributes:
@@ -69,7 +69,7 @@ class Observation:
 class Monitor:
     """Counts of consecutive cycles per drive; `update` returns the next state and alarms."""
 
-    limits: WatchLimits
+    limits: MonitorLimits
     names: tuple[str, ...]
     missing: tuple[int, ...]
     slack: tuple[int, ...]
@@ -77,7 +77,7 @@ class Monitor:
     over: tuple[int, ...]
 
     @classmethod
-    def fresh(cls, limits: WatchLimits, names: Sequence[str]) -> Monitor:
+    def fresh(cls, limits: MonitorLimits, names: Sequence[str]) -> Monitor:
         """The initial state, for drives of these names."""
         zeros = (0,) * len(names)
         return cls(limits, tuple(names), zeros, zeros, zeros, zeros)

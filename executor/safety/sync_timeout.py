@@ -25,7 +25,8 @@ from dataclasses import dataclass
 # Source: CiA 301 (communication cycle period, 1006h), CiA 402-2 (transition 16). Pure.
 
 
-#: Periods without SYNC after which drives stop on their own unless their profile says otherwise.
+#: Time-out of drive groups without SYNC, in periods; that of CANopen drives is in their profile,
+#: as `sync_timeout_periods`.
 USUAL_TIMEOUT = 3.0
 #: Shortest time-out of a drive that can be kept enabled, in periods.
 LEAST_TIMEOUT = 1.1

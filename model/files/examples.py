@@ -103,7 +103,7 @@ def select_examples(examples: Iterable[Example], names: Iterable[str]) -> list[E
     unknown = [name for name in wanted if name not in by_name]
     if unknown:
         raise BadInput(
-            f"no example {unknown[0]!r}",
+            f"unknown example {unknown[0]!r}",
             where="cdpr examples",
             next_step=f"name one of these: {', '.join(by_name)}",
         )

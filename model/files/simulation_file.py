@@ -149,7 +149,7 @@ class SimulationDocument(Document):
         for i, name in enumerate(names):
             name_key = ("simulation", "cameras", i, "name")
             if name not in cameras:
-                found.append((name_key, f"there is no camera {name!r}"))
+                found.append((name_key, f"unknown camera {name!r}"))
             elif name in names[:i]:
                 found.append((name_key, f"camera {name!r} appears twice"))
             elif self.cameras[i].exposure_ms > 1000.0 / cameras[name]:

@@ -46,7 +46,7 @@ def relative(start: Array, end: Array) -> Quaternion:
 
 
 @kernel
-def turn_between(start: Array, end: Array) -> Vector:
+def rotation_between(start: Array, end: Array) -> Vector:
     """The rotation vector from a pose to another, in the frame of the first, [rad]."""
     w, x, y, z = relative(start, end)
     sine = math.sqrt(x * x + y * y + z * z)
@@ -59,7 +59,7 @@ def turn_between(start: Array, end: Array) -> Vector:
 @kernel
 def move_length(start: Array, end: Array, radian: float) -> float:
     """Length of a move, a radian of rotation weighted as a length, [m]."""
-    turn = turn_between(start, end)
+    turn = rotation_between(start, end)
     squared = radian * radian * (turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2)
     for axis in range(3):
         squared += (end[axis] - start[axis]) ** 2
@@ -69,7 +69,7 @@ def move_length(start: Array, end: Array, radian: float) -> float:
 @kernel
 def put_between(start: Array, end: Array, share: float, found: Array) -> None:
     """Writes the pose at a share of a move, shape (7,)."""
-    turn = turn_between(start, end)
+    turn = rotation_between(start, end)
     for axis in range(3):
         found[axis] = start[axis] + share * (end[axis] - start[axis])
     put_rotated(start, (share * turn[0], share * turn[1], share * turn[2]), found)
@@ -373,7 +373,7 @@ def move_allowed(problem: RotatingProblem, start: Array, end: Array, tallies: In
     if not rotations_kept(problem.tilt, problem.turn, start, end):
         tallies[ROTATION] += 1
         return False
-    turn = np.array(turn_between(start, end))
+    turn = np.array(rotation_between(start, end))
     if not turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2 <= LARGEST_TURN**2:
         tallies[ROTATION] += 1
         return False

@@ -52,19 +52,20 @@ def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -
     return points[kept[::-1]]
 
 
-def drawn_tight(
-    path: Array, is_free: IsFree, cost: Cost, steps: tuple[float, ...] = (0.02, 0.01, 0.005, 0.002)
-) -> Array:
+#: Sizes of the moves tried, largest first, [m].
+_STEPS = (0.02, 0.01, 0.005, 0.002)
+
+
+def pull_tight(path: Array, is_free: IsFree, cost: Cost) -> Array:
     """Moves corners, one coordinate direction at a time, while the path gets cheaper.
 
     Args:
         path: Allowed from node to node, shape (k, n).
         is_free: Whether an edge is allowed.
         cost: Of edges.
-        steps: Sizes of the moves tried, largest first, [m].
     """
     tight = path.copy()
-    for step in steps:
+    for step in _STEPS:
         for _ in range(10):
             moved = [_move_corner(tight, k, step, is_free, cost) for k in range(1, len(tight) - 1)]
             if not any(moved):
@@ -165,7 +166,7 @@ def _post_processed(raw: Array, planner: PaperPlanner, kinematic: KinematicCost)
     length = float(np.sum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
     for _ in range(_ROUNDS):
         path = cheapest_through(path, planner.edge, cost, length / _SPREAD_POINTS)
-        path = drawn_tight(path, planner.edge, cost)
+        path = pull_tight(path, planner.edge, cost)
     return planner.shortcut(path, _FOR_FEWER_CORNERS)
 
 

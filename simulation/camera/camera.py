@@ -55,14 +55,14 @@ SHARP_RADIUS = 1.2
 """Standard deviation of the blur in unsharp masking, [px]."""
 
 
-def veil_of(camera: Camera, optics: Optics) -> Image32:
+def halo_of(camera: Camera, optics: Optics) -> Image32:
     """Brightness that the lamp's halo adds to each pixel."""
     if optics.halo == 0.0:
         return np.zeros((camera.height, camera.width), np.float32)
     down, across = np.mgrid[: camera.height, : camera.width].astype(np.float32)
     away = np.hypot(across - LAMP[0] * camera.width, down - LAMP[1] * camera.height)
-    veil = 255.0 * optics.halo * np.exp(-away / (HALO_REACH * camera.width))
-    return np.asarray(veil, dtype=np.float32)
+    halo = 255.0 * optics.halo * np.exp(-away / (HALO_REACH * camera.width))
+    return np.asarray(halo, dtype=np.float32)
 
 
 def light_of(camera: Camera, optics: Optics) -> Image32:
@@ -78,7 +78,7 @@ def light_of(camera: Camera, optics: Optics) -> Image32:
     return np.asarray(light, dtype=np.float32)
 
 
-def before_the_sensor(picture: Image8, optics: Optics) -> Image8:
+def reduced_to_sensor(picture: Image8, optics: Optics) -> Image8:
     """The image reduced to the sensor's pixels, before it is enlarged again."""
     if optics.enlarged == 1:
         return picture
@@ -87,7 +87,7 @@ def before_the_sensor(picture: Image8, optics: Optics) -> Image8:
     return np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def processed(picture: Image8, size: tuple[int, int], optics: Optics) -> Image8:
+def apply_processing(picture: Image8, size: tuple[int, int], optics: Optics) -> Image8:
     """The image after the camera's processing.
 
     Args:
@@ -242,8 +242,8 @@ class SyntheticCamera:
         self.optics = optics or Optics()
         self._camera_from_world = camera.world_from_camera.inverse()
         self._background = _background(rig, scene, camera)
-        self._light, self._veil = light_of(camera, self.optics), veil_of(camera, self.optics)
-        self._still = self._exposed(self._background, self._light, self._veil)
+        self._light, self._halo = light_of(camera, self.optics), halo_of(camera, self.optics)
+        self._still = self._exposed(self._background, self._light, self._halo)
         self._depth = self._background.depth[1::SAMPLES, 1::SAMPLES].copy()
         self._noise = _noise(camera, self.optics.noise, seed)
 
@@ -329,7 +329,7 @@ class SyntheticCamera:
             canvas = self._background.part(region).copy()
             self._draw_platform(canvas, pose)
             rows, columns = region.slices()
-            parts = self._light[rows, columns], self._veil[rows, columns]
+            parts = self._light[rows, columns], self._halo[rows, columns]
             picture[rows, columns] = self._exposed(canvas, *parts)
             depth = depth.copy()
             depth[rows, columns] = canvas.depth[1::SAMPLES, 1::SAMPLES]
@@ -355,17 +355,17 @@ class SyntheticCamera:
         for tag in self.rig.platform_tags:
             draw_tag(canvas, self.rig.tag_family, tag, self._camera_from_world, pose)
 
-    def _exposed(self, canvas: Canvas, light: Image32, veil: Image32) -> Image8:
+    def _exposed(self, canvas: Canvas, light: Image32, halo: Image32) -> Image8:
         pixels = canvas.pixels()
         if self.optics.blur > 0:
             pixels = np.asarray(cv2.GaussianBlur(pixels, (0, 0), self.optics.blur), np.float32)
-        return np.asarray(np.clip(pixels * light + veil + 0.5, 0, 255), dtype=np.uint8)
+        return np.asarray(np.clip(pixels * light + halo + 0.5, 0, 255), dtype=np.uint8)
 
     def _taken(self, picture: Image8, frame: int) -> Image8:
         """The image after sensor noise and processing."""
         size = (self.camera.width, self.camera.height)
-        noisy = self._with_noise(before_the_sensor(picture, self.optics), frame)
-        return processed(encoded(self.camera, noisy), size, self.optics)
+        noisy = self._with_noise(reduced_to_sensor(picture, self.optics), frame)
+        return apply_processing(encoded(self.camera, noisy), size, self.optics)
 
     def _with_noise(self, picture: Image8, frame: int) -> Image8:
         if self.optics.noise <= 0:

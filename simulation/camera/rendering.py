@@ -29,8 +29,9 @@ from model.shapes import (
     convex_hull,
     shape_points,
 )
-from model.tag_families import drawn_upside_down, opencv_dictionary
+from model.tag_families import drawn_upside_down
 from tracking.camera_model import pixels_of
+from tracking.detection.tags import dictionary, modules_across
 
 #: Samples per pixel along x and along y.
 SAMPLES = 2
@@ -285,15 +286,6 @@ def _strips(grid: Array) -> Array:
 INK, PAPER = 28.0, 236.0
 
 
-def _dictionary(family: str) -> cv2.aruco.Dictionary:
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, opencv_dictionary(family)))
-
-
-def modules_across(family: str) -> int:
-    """Modules along the side of the black square."""
-    return _dictionary(family).markerSize + 2
-
-
 @lru_cache(maxsize=256)
 def tag_print(family: str, number: int, across: int, down: int) -> Image32:
     """A tag with one white module around it, upright as in its own project.
@@ -305,7 +297,7 @@ def tag_print(family: str, number: int, across: int, down: int) -> Image32:
         down: Texels along its left side.
     """
     modules = modules_across(family)
-    picture = np.asarray(cv2.aruco.generateImageMarker(_dictionary(family), number, modules))
+    picture = np.asarray(cv2.aruco.generateImageMarker(dictionary(family), number, modules))
     upright = picture[::-1, ::-1] if drawn_upside_down(family) else picture
     upright = np.pad(upright, 1, constant_values=255)
     print_: Image32 = np.where(upright > 127, PAPER, INK).astype(np.float32)

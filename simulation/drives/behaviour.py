@@ -316,7 +316,7 @@ def behaviour_named(names: Iterable[str], base: DriveBehaviour = STRICT) -> Driv
         named = _BY_NAME.get(name)
         if named is None:
             raise BadInput(
-                f"there is no behaviour {name!r} of simulated drives",
+                f"unknown behaviour {name!r} of simulated drives",
                 where="--drive-behaviour",
                 why="known behaviours: " + ", ".join(_BY_NAME),
                 next_step="list them with `cdpr sim RIG --drive-behaviour list`",

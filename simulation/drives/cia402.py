@@ -16,7 +16,6 @@ from math import inf
 from drivers.cia402.pdo import (
     EMCY_BASE,
     HEARTBEAT_BASE,
-    RPDO1_BASE,
     SDO_REPLY_BASE,
     NmtCommand,
     NmtState,
@@ -221,10 +220,6 @@ class SimulatedDrive(PowerStage):
         self._take_waiting()
         if is_at_switch:
             self._stop_at_switch()
-
-    def on_set_point(self, data: Frame) -> None:
-        """RPDO1 with its default identifier."""
-        self.on_pdo(RPDO1_BASE + self.node, data)
 
     def on_pdo(self, can_id: int, data: Frame) -> None:
         """An RPDO: unpacked by the current mapping, kept until the next SYNC if synchronous."""

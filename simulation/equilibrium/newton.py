@@ -39,7 +39,7 @@ class Hanging(NamedTuple):
     centre: Array
 
 
-class Strained(NamedTuple):
+class StrainedCables(NamedTuple):
     """The cables at a pose; kernels fill it.
 
     Attributes:
@@ -105,7 +105,7 @@ def run_cable(
 
 @compiled
 def strain(
-    hanging: Hanging, unstrained: Array, position: Array, rotation: Array, seen: Strained
+    hanging: Hanging, unstrained: Array, position: Array, rotation: Array, seen: StrainedCables
 ) -> bool:
     """Fills ``seen`` for a pose; False if a cable has no path."""
     for k in range(len(unstrained)):
@@ -126,7 +126,7 @@ def strain(
 
 @compiled
 def slope(
-    hanging: Hanging, rotation: Array, seen: Strained, tensions: Array, gradient: Array
+    hanging: Hanging, rotation: Array, seen: StrainedCables, tensions: Array, gradient: Array
 ) -> None:
     """Fills the energy's derivative by a twist: minus the wrench, shape (6,), [N, N·m]."""
     gradient[:] = 0.0
@@ -143,7 +143,7 @@ def slope(
 def bend(
     hanging: Hanging,
     rotation: Array,
-    seen: Strained,
+    seen: StrainedCables,
     rates: Array,
     tensions: Array,
     stiffness: Array,
@@ -225,7 +225,9 @@ def hang_still(
     """
     count = len(unstrained)
     pulls = tensions > 0.0
-    seen = Strained(np.empty((count, 3)), np.empty((count, 6)), np.empty(count), np.empty(count))
+    seen = StrainedCables(
+        np.empty((count, 3)), np.empty((count, 6)), np.empty(count), np.empty(count)
+    )
     gradient, stiffness, rates = np.empty(6), np.empty((6, 6)), np.empty(count)
     for _ in range(steps):
         if not strain(hanging, unstrained, position, rotation, seen):

@@ -477,7 +477,7 @@ def test_a_number_that_cannot_be_is_refused_before_anything_is_read(
         "deviation of outlets must be": partial(
             cdpr.calibrate_rig, rig, "absent", deviations={"outlets": number}
         ),
-        "no parameter group 'outlet'": partial(
+        "unknown parameter group 'outlet'": partial(
             cdpr.calibrate_rig, rig, "absent", deviations={"outlet": 1e-3}
         ),
         "a pose deviation must be": partial(

@@ -120,7 +120,7 @@ def test_a_result_that_is_not_good_enough_is_used_with_a_remark(rig: Rig) -> Non
 @pytest.mark.parametrize(
     ("result", "named"),
     [
-        (camera_result_of("side"), "no camera 'side'"),
+        (camera_result_of("side"), "unknown camera 'side'"),
         (camera_result_of(size=(640, 480)), "640 x 480 px, camera 'front' takes 1280 x 720 px"),
     ],
 )

@@ -134,8 +134,8 @@ def test_the_option_is_named_as_it_was_typed(
     ("text", "shown"),
     [
         (
-            "`budget=` and `rounds=` exclude each other",
-            "--budget-ms and --rounds exclude each other",
+            "`budget=` and `rounds=` contradict each other",
+            "--budget-ms and --rounds contradict each other",
         ),
         ("leave out `weights=`", "leave out --weight"),
         ("pass `planner='optimal'`", "pass --planner optimal"),
@@ -329,7 +329,7 @@ def test_another_camera_without_a_source_is_not_the_current_folder(
     with nothing_written(folder):
         answer = call(*words, "--beside", beside)
     one_message(answer, 2)
-    assert "source" in answer.said or "no camera ''" in answer.said
+    assert "source" in answer.said or "unknown camera ''" in answer.said
 
 
 SECRET = "s3cret"

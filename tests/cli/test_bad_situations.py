@@ -362,7 +362,7 @@ def test_a_rig_without_tags_or_camera_needs_no_camera(folder: Path) -> None:
             ["'/nowhere/run.avi' is not a live camera source", "/dev/video0"],
         ),
         ({"camera": "file:///tmp/run.avi"}, ["is not a live camera source"]),
-        ({"camera": "frnt=0"}, ["no camera 'frnt'", "name one of: front"]),
+        ({"camera": "frnt=0"}, ["unknown camera 'frnt'", "name one of: front"]),
         ({"camera": "front"}, ["camera 'front' has no source", "write front=0"]),
         ({"camera": "front="}, ["camera 'front' has no source", "write front=0"]),
         (
@@ -400,7 +400,7 @@ def test_a_source_that_shows_nothing_leaves_no_pose_log(
 
 def test_a_camera_that_the_rig_does_not_have_lists_those_it_has(tmp_path: Path) -> None:
     answer = call("track", RIG, tmp_path, "-o", tmp_path / "poses.csv", "--camera", "back")
-    one_message(answer, 2, "no camera 'back'", "front")
+    one_message(answer, 2, "unknown camera 'back'", "front")
 
 
 # Runs that were, and options.

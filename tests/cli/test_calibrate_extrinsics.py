@@ -167,7 +167,7 @@ def test_people_read_the_verdict_first(folder) -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (("--camera", "side"), "no camera 'side'"),
+        (("--camera", "side"), "unknown camera 'side'"),
         (("--pictures", "2"), "--pictures is for a video or a camera"),
         (("--poses", "missing.csv"), "no such file"),
         (("--calibration", RIG), "not a calibration result"),

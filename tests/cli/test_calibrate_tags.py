@@ -133,7 +133,7 @@ def test_people_read_what_changed_against_the_rig_file(folder) -> None:
     ("options", "named"),
     [
         (("--fixed-tag", "7"), "no tag 7 on the platform"),
-        (("--camera", "side"), "no camera 'side'"),
+        (("--camera", "side"), "unknown camera 'side'"),
         (("--pictures", "2"), "--pictures is for a video or a camera"),
     ],
 )

@@ -38,7 +38,7 @@ def test_results_about_another_camera_are_refused_by_name(tmp_path: Path, verb: 
         assert call("plan", RIG, SCENE, "-o", tmp_path / "plan.json").code == 0
     with nothing_written(tmp_path):
         answer = call(verb, *options, "--calibration", result)
-    one_message(answer, 2, "no camera 'side'", "front")
+    one_message(answer, 2, "unknown camera 'side'", "front")
 
 
 @pytest.mark.parametrize("good", [True, False])
@@ -99,4 +99,4 @@ def test_a_result_about_another_camera_is_not_applied(tmp_path: Path) -> None:
     result = write_result(tmp_path, camera_result_of("side"))
     with nothing_written(tmp_path):
         answer = call("calibrate", "apply", RIG, result, "-o", tmp_path / "new.yaml")
-    one_message(answer, 2, "no camera 'side'", "front")
+    one_message(answer, 2, "unknown camera 'side'", "front")

@@ -72,6 +72,6 @@ def test_a_folder_that_cannot_be_created_is_named_as_such(
 
 def test_a_name_that_is_unknown_lists_those_there_are(tmp_path: Path) -> None:
     answer = call("examples", "gachon", "-o", tmp_path)
-    one_message(answer, 2, "no example 'gachon'", "gachon_8_6, ")
+    one_message(answer, 2, "unknown example 'gachon'", "gachon_8_6, ")
     one_message(call("examples", "--all", "turn"), 2, "--all copies every example")
     one_message(call("examples", "-o", tmp_path), 2, "-o needs something to copy")

@@ -33,7 +33,7 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (("--at-home", "--camera", "synthetic"), 2, "state the platform pose"),
         (("--camera", "0"), 2, "--fast needs synthetic cameras"),
         (("--camera", "run.avi"), 2, "'run.avi' is not a live camera source"),
-        (("--camera", "side=0"), 2, "no camera 'side'"),
+        (("--camera", "side=0"), 2, "unknown camera 'side'"),
         (("--camera", "front=0", "--camera", "front=1"), 2, "2 cameras are given; only one"),
         (("--at-home", "--pose-mm", "0", "0", "445"), 2, "state the platform pose"),
         (("--at-home", "--as-rig-file"), 2, "state the platform pose"),

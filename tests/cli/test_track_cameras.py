@@ -153,9 +153,9 @@ def test_a_plan_is_for_those_cameras_that_are_synthetic(
 @pytest.mark.parametrize(
     ("sources", "parts"),
     [
-        (["front=synthetic", "back=synthetic"], ["no camera 'back'", "front, side"]),
+        (["front=synthetic", "back=synthetic"], ["unknown camera 'back'", "front, side"]),
         (["front=synthetic", "synthetic"], ["'synthetic' does not name its camera"]),
-        (["frnt=synthetic"], ["no camera 'frnt'", "front, side"]),
+        (["frnt=synthetic"], ["unknown camera 'frnt'", "front, side"]),
         (["side="], ["camera 'side' has no source", "write side=0"]),
         (["front=somewhere", "side=somewhere"], ["'front' and 'side' have the same source"]),
         (["front=synthetic", "front=synthetic"], ["'front' has two sources"]),

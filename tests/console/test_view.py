@@ -24,7 +24,7 @@ from cdpr.console.view import (
     RobotNow,
     RobotView,
     commanded_pose,
-    measured_data,
+    measured_view,
     nearest_data,
 )
 from cdpr.console.watch import USED_FOR, RobotWatch
@@ -335,7 +335,7 @@ def measurement_with(covariance: Array) -> dict[str, Any]:
 def test_the_ellipsoid_is_that_of_the_covariance(root: Array) -> None:
     """Its half axes are at right angles, and their squares add up to the covariance."""
     covariance = root @ root.T
-    shown = measured_data(measurement_with(covariance), 0.1)
+    shown = measured_view(measurement_with(covariance), 0.1)
     axes = np.array(shown["half_axes_mm"])
     assert axes.T @ axes / ELLIPSOID_SCALE**2 == pytest.approx(covariance, abs=2e-3)
     apart = axes @ axes.T

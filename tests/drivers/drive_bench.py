@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -19,6 +20,11 @@ from model.rig import Rig
 from model.statics.gravity import working_tensions
 from simulation.drives.cia402 import SimulatedDrive
 from simulation.drives.cia402_rig import SimulatedCia402Rig
+
+
+def make_reply(status_word: int, position: int, torque: int) -> bytes:
+    """TPDO1: 6041h status word, 6064h position actual [counts], 6077h torque [per mille]."""
+    return struct.pack("<Hih", status_word, position, torque)
 
 
 class Bench:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 from drivers.cia402.monitor import DriveMonitor
-from drivers.cia402.pdo import EMCY_BASE, TPDO1_BASE, NmtCommand, make_emergency, make_reply
+from drivers.cia402.pdo import EMCY_BASE, TPDO1_BASE, NmtCommand, make_emergency
 from drivers.cia402.state_machine import DriveState, Goal
 from drivers.drive_group import GroupState
 from model.files.drive_profile_file import ProfileDocument
 from simulation.drives.cia402 import SimulatedDrive
-from tests.drivers.drive_bench import Bench
+from tests.drivers.drive_bench import Bench, make_reply
 
 NAMES = {3: "cable 1 (drive 3)", 5: "cable 2 (drive 5)"}
 ENABLED, FAULT = 0x0237, 0x0218

@@ -19,7 +19,6 @@ from drivers.cia402.pdo import (
     make_emergency,
     make_heartbeat,
     make_nmt,
-    make_reply,
     make_set_point,
     make_sync,
     parse_emergency,
@@ -33,7 +32,7 @@ from drivers.cia402.state_machine import ControlWord
 def test_golden_bytes() -> None:
     assert make_set_point(0x000F, 0x01020304).hex() == "0f0004030201"
     assert make_set_point(0x0002, -2).hex() == "0200feffffff"
-    assert make_reply(0x1237, -1, 1000).hex() == "3712ffffffffe803"
+    assert parse_reply(bytes.fromhex("3712ffffffffe803")) == (0x1237, -1, 1000)
     assert make_sync() == b""
     assert make_heartbeat(NmtState.OPERATIONAL) == b"\x05"
     assert make_nmt(NmtCommand.START, 3) == b"\x01\x03"
@@ -88,7 +87,7 @@ def test_every_bit_of_a_heartbeat_but_the_toggle_bit_counts(byte: int, state: in
     torque=st.integers(-(2**15), 2**15 - 1),
 )
 def test_what_is_made_is_what_is_read(word: int, position: int, torque: int) -> None:
-    assert parse_reply(make_reply(word, position, torque)) == (word, position, torque)
+    assert parse_reply(struct.pack("<Hih", word, position, torque)) == (word, position, torque)
     assert parse_set_point(make_set_point(word, position)) == (word, position)
 
 

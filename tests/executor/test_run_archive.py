@@ -163,7 +163,7 @@ def test_a_record_too_large_to_read_is_named_with_its_size_and_where_to_read_it(
     folder = without(blind, tmp_path / "run", "report.html")
     result, course, events = evaluate_folder(folder), folder.course(), folder.events()
     limit = (folder.path / "cycles.csv").stat().st_size - 1
-    for module in ("executor.recording.csv_columns", "executor.run_result"):
+    for module in ("executor.recording.table_files", "executor.run_result"):
         monkeypatch.setattr(f"{module}.TABLE_LIMIT", limit)
     missing = write_end(folder, course, result, events)
     size = f"{folder.path / 'cycles.csv'}: the file has {(limit + 1) / 1e6:.1f} MB; at most"

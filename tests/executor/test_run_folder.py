@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from executor.recording import csv_columns, record_files
+from executor.recording import record_files, table_files
 from executor.recording.clearance import ClearanceTable, no_clearance
 from executor.recording.recorder import ROW, ROW_PER_CABLE
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
@@ -425,7 +425,7 @@ def test_only_the_limit_of_tables_ends_reading_a_record(
     folder = fake_run.write(run, tmp_path / "run", pictures=False)
     size = (folder.path / "cycles.csv").stat().st_size
     for limit, is_read in ((size, True), (size - 1, False)):
-        monkeypatch.setattr(csv_columns, "TABLE_LIMIT", limit)
+        monkeypatch.setattr(table_files, "TABLE_LIMIT", limit)
         monkeypatch.setattr(record_files, "TABLE_LIMIT", limit)
         for read in (folder.cycles, lambda: folder.cycles_cut_short(8)):
             if is_read:

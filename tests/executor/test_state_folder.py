@@ -204,7 +204,7 @@ def test_a_fault_is_not_reset_with_the_file_of_another_rig(tmp_path: Path) -> No
     latch = FaultLatch(BUS)
     latch.engage("eight cables", tmp_path, "drive 8 is in fault")
     with (
-        pytest.raises(Refused, match="of rig 'eight cables', not of 'four cables'"),
+        pytest.raises(Refused, match="to rig 'eight cables', not to 'four cables'"),
         latch.held_for_reset("four cables", latch.read()),
     ):
         pytest.fail("it would be reset")

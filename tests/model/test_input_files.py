@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calibration.geometry.measurements import read_rig_data
-from executor.recording.csv_columns import TableFile
+from executor.recording.table_files import TableFile
 from model.errors import BadInput, InvalidFile
 from model.files.documents import load_yaml
 from model.files.reading import (

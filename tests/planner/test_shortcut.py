@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from planner.costs import LengthCost
-from planner.rrt.path import cheapest_through, drawn_tight
+from planner.rrt.path import cheapest_through, pull_tight
 
 COST = LengthCost()
 
@@ -46,7 +46,7 @@ def test_every_step_keeps_ends_and_freedom_and_never_costs_more(seed: int) -> No
     path = wandering_path(seed)
     for made in (
         cheapest_through(path, is_free, COST, 0.05),
-        drawn_tight(path, is_free, COST),
+        pull_tight(path, is_free, COST),
     ):
         assert np.array_equal(made[0], path[0])
         assert np.array_equal(made[-1], path[-1])
@@ -59,7 +59,7 @@ def test_drawing_tight_comes_within_two_percent_of_the_shortest_path() -> None:
     path = 0.5 * np.column_stack([np.cos(angles), np.sin(angles)])
     tight = path
     for _ in range(2):
-        tight = drawn_tight(cheapest_through(tight, is_free, COST, 0.03), is_free, COST)
+        tight = pull_tight(cheapest_through(tight, is_free, COST, 0.03), is_free, COST)
     # Two tangents to the disc and the arc between them.
     tangent = np.sqrt(0.5**2 - 0.3**2)
     shortest = 2 * tangent + 0.3 * (np.pi - 2 * np.arccos(0.3 / 0.5))

@@ -21,7 +21,7 @@ from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup, GroupState
 from drivers.factory import make_drive_group, read_drives
 from executor.cameras.client import static_pose
-from executor.control.preconditions import counted_here, require_below, with_reduced_limits
+from executor.control.preconditions import require_below, with_counts_at, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
 from executor.control.winch_loop import LawMotion, WinchesHere
 from executor.control.winch_motion import WinchResult, move_winches, recording, require_held
@@ -156,7 +156,7 @@ def after_power_loss(
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure()
         counts = group.read_positions().positions.tolist()
-        counted = counted_here(rig, counts, rig.home)
+        counted = with_counts_at(rig, counts, rig.home)
         as_set_up = with_reduced_limits(counted, limit=limit, speed=speed)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=limit)
         group.configure()
@@ -747,7 +747,7 @@ def wound_in(rig: Rig, targets: Array, *, on_a_stand: bool) -> WinchResult:
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure()
         counts: Sequence[int] = group.read_positions().positions.tolist()
-        counted = counted_here(rig, counts, rig.home)
+        counted = with_counts_at(rig, counts, rig.home)
         limited = with_reduced_limits(counted, limit=400.0, speed=0.005)
         group = make_drive_group(counted, near, rehearsal.pump, max_tension=400.0)
         group.configure()

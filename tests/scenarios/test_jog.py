@@ -61,7 +61,7 @@ def test_a_platform_frame_that_points_down_is_jogged_home_like_any_other() -> No
         ((*BY, "--no-scene", "--scene", "scene.yaml"), 2, "obstacles are unknown"),
         ((*BY, "--no-scene", "--fast", "--interface", "udp_multicast"), 2, "--fast"),
         (("--fast",), 2, "no motion given"),
-        (("--to-home", *BY), 2, "exclude each other"),
+        (("--to-home", *BY), 2, "contradict each other"),
         (("--to-home",), 2, "obstacles are unknown"),
         ((*BY, "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),
     ],

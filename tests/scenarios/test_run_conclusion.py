@@ -94,7 +94,7 @@ def test_a_full_disk_at_the_end_changes_neither_verdict_nor_exit_code(
 
     def write_end(*arguments: object, **options: object) -> object:
         monkeypatch.setattr("executor.recording.run_folder.write_atomic", full)
-        monkeypatch.setattr("executor.recording.csv_columns.write_atomic", full)
+        monkeypatch.setattr("executor.recording.table_files.write_atomic", full)
         monkeypatch.setattr("executor.report.write_atomic", full)
         monkeypatch.setattr("executor.recording.record_files.write_atomic", full)
         return write(*arguments, **options)  # type: ignore[arg-type]

@@ -178,7 +178,7 @@ def test_a_camera_is_named_by_an_integer_of_any_type(rig_file: Path, wanted: Any
 @pytest.mark.parametrize(
     ("cameras", "parts"),
     [
-        (["front=0", "back=1"], ["no camera 'back'", "front, side"]),
+        (["front=0", "back=1"], ["unknown camera 'back'", "front, side"]),
         (["0", "side=1"], ["'0' does not name its camera"]),
         (["side=0", "side=1"], ["'side' has two sources"]),
         (["side=0", "front=0"], ["cameras 'side' and 'front' have the same source '0'"]),

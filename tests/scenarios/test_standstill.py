@@ -13,7 +13,7 @@ from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import CycleStatus, DriveGroup, DriveSnapshot, GroupState, Pace
 from drivers.factory import make_drive_group, read_drives
 from drivers.odrive.messages import AxisError
-from executor.control.preconditions import set_up_here
+from executor.control.preconditions import configuration_at_rest
 from executor.control.standstill import FaultReset, Release, Standstill
 from executor.control.sync_master import SyncMaster
 from executor.realtime.scheduling import SimulatedClock
@@ -83,7 +83,7 @@ def held(
             rehearsal.drives[in_fault[0]].state = in_fault[1]
             rehearsal.drives[in_fault[0]]._move = lambda _elapsed: None  # type: ignore[method-assign]
         seen: DriveSnapshot = read_drives(rig, near, rehearsal.pump)
-        rig = set_up_here(rig, seen)[0]
+        rig = configuration_at_rest(rig, seen)[0]
         group = make_drive_group(rig, near, rehearsal.pump)
         group.configure(to_reset=True)
         yield Held(rehearsal, group)

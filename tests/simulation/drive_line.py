@@ -86,7 +86,7 @@ class Line:
         self.drive.on_nmt(0x01, NODE)
 
     def set_point(self, word: int, target: int | None = None) -> None:
-        self.drive.on_set_point(struct.pack("<Hih", word, target or self.target, 0))
+        self.drive.on_pdo(0x205, struct.pack("<Hih", word, target or self.target, 0))
 
     def sync(self, word: int | None, target: int | None = None) -> int | None:
         """One cycle; the status word's state bits that the SYNC after it reports."""

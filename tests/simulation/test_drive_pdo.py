@@ -181,6 +181,6 @@ def test_a_set_point_after_the_synchronous_window_is_dropped(window_us: int) -> 
     line.write(0x1007, 0, "<I", window_us)
     line.drive.on_sync()
     line.drive.advance(0.006)
-    line.drive.on_set_point(struct.pack("<HiH", 0x06, 1000, 0))
+    line.drive.on_pdo(0x205, struct.pack("<HiH", 0x06, 1000, 0))
     line.drive.on_sync()
     assert bool(line.take(0x085)) == bool(window_us)

@@ -228,7 +228,7 @@ def test_true_tags_stay_where_they_are_whatever_the_rig_file_says(rig: Rig, scen
     [
         ({"as_built": "short"}, "simulation.as_built.outlets_mm", "needs 8 entries"),
         ({"as_built": "pulleys"}, "pulley_radius_mm", "the rig has no pulleys"),
-        ({"cameras": [{"name": "rear"}]}, "simulation.cameras[0].name", "there is no camera"),
+        ({"cameras": [{"name": "rear"}]}, "simulation.cameras[0].name", "unknown camera"),
         ({"cameras": [{"name": "front"}] * 2}, "simulation.cameras[1].name", "appears twice"),
         (
             {"tags": {"platform": [{"id": 999, "size_mm": 96, "position_mm": [0, 0, 65]}]}},

@@ -18,7 +18,7 @@ from model.statics.gravity import weight_wrench, working_tensions
 from model.statics.tension_distribution import TensionInfeasible
 from model.winches import WinchMap
 from simulation import plant as plant_module
-from simulation.equilibrium.newton import Strained, bend, is_positive, slope, solve, strain
+from simulation.equilibrium.newton import StrainedCables, bend, is_positive, slope, solve, strain
 from simulation.plant import Plant, Suspension
 
 WEIGHT = 0.4 * 9.80665
@@ -235,7 +235,9 @@ def test_compiled_forces_and_stiffness_are_those_of_the_readable_code(
     tensions = hung.axial * np.maximum(strains, 0.0)
     rates = hung.rates(strains > 0.0)
     rotated = np.array(pose.rotation)
-    seen = Strained(np.empty((count, 3)), np.empty((count, 6)), np.empty(count), np.empty(count))
+    seen = StrainedCables(
+        np.empty((count, 3)), np.empty((count, 6)), np.empty(count), np.empty(count)
+    )
     gradient, stiffness = np.empty(6), np.empty((6, 6))
     assert strain(hung.hanging, hung.unstrained, np.array(pose.position), rotated, seen)
     slope(hung.hanging, rotated, seen, tensions, gradient)

@@ -272,7 +272,7 @@ def test_the_software_limits_never_cross(line: Line) -> None:
 
 def test_a_short_set_point_is_ignored_and_reported(line: Line) -> None:
     line.enable()
-    line.drive.on_set_point(b"\0" * 6)
+    line.drive.on_pdo(0x205, b"\0" * 6)
     assert line.sync(None) == ENABLED
     assert line.emergencies() == [0x8210]
 

@@ -100,11 +100,11 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
 
 def _checksums(seed: Path, scratch: Path) -> list[Reader]:
     """Compares the files of a run with mutated checksums."""
-    from executor.recording.checksums import require_unchanged
+    from executor.recording.checksums import require_unchanged_files
 
     folder = scratch / "checksums"
     shutil.copytree(seed.parent, folder)
-    call = lambda path: require_unchanged(path.parent)  # noqa: E731
+    call = lambda path: require_unchanged_files(path.parent)  # noqa: E731
     return [Reader("checksums", seed, call, folder / seed.name)]
 
 

@@ -195,7 +195,7 @@ def extrinsics(
     if beside is not None:
         if poses is not None:
             raise BadInput(
-                "--beside and --poses exclude each other",
+                "--beside and --poses contradict each other",
                 where="calibrate extrinsics",
                 next_step="pass --poses for the rig's motion, or --beside for another camera",
             )

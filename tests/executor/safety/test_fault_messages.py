@@ -13,7 +13,7 @@ from executor.safety.fault_messages import (
     slack,
     stuck,
 )
-from executor.safety.monitor import Monitor, Observation, WatchLimits
+from executor.safety.monitor import Monitor, MonitorLimits, Observation
 from tests.executor import fake_run
 
 NAMES = [f"cable {k} (drive {k + 10})" for k in range(1, 9)]
@@ -21,7 +21,7 @@ NAMES = [f"cable {k} (drive {k + 10})" for k in range(1, 9)]
 
 def silent(*drives: int, cycles: int = 2) -> tuple[Alarm, ...]:
     """Alarms when these drives do not answer for a number of cycles."""
-    watch = Monitor.fresh(WatchLimits(1e-3, 2.0, 50.0, 0.5), NAMES)
+    watch = Monitor.fresh(MonitorLimits(1e-3, 2.0, 50.0, 0.5), NAMES)
     found: tuple[Alarm, ...] = ()
     missing = [drive in drives for drive in range(1, 9)]
     for _ in range(cycles):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from executor.safety.limits import gate_limits, stuck_limits, tension_limits, watch_limits
+from executor.safety.limits import gate_limits, monitor_limits, stuck_limits, tension_limits
 from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckLimits
 from executor.safety.sync_timeout import SyncAge
@@ -22,7 +22,7 @@ def test_tensions_of_the_papers_rig():
 
 def test_the_watch_judges_by_the_rig_file():
     rig = load_rig(RIG)
-    limits = watch_limits(rig, SyncAge())
+    limits = monitor_limits(rig, SyncAge())
     assert limits.following_error == rig.motion.following_error == pytest.approx(0.002)
     assert (limits.min_tension, limits.max_tension) == tension_limits(rig)
     assert limits.no_tension == pytest.approx(0.5)
@@ -31,12 +31,12 @@ def test_the_watch_judges_by_the_rig_file():
 @pytest.mark.parametrize(("timeout", "gone"), [(3.0, 1.5), (1.5, 0.25), (2.0, 0.5), (5.0, 3.5)])
 def test_lateness_counts_from_one_period_after_the_last_sync(timeout, gone):
     """A cycle that begins L periods late finds a SYNC that is 1 + L periods old."""
-    assert watch_limits(load_rig(RIG), SyncAge(timeout)).gone_periods == pytest.approx(gone)
+    assert monitor_limits(load_rig(RIG), SyncAge(timeout)).gone_periods == pytest.approx(gone)
 
 
 def test_where_cables_may_hang_slack_the_watch_says_nothing_of_it():
     rig = load_rig(RIG)
-    limits = watch_limits(rig, SyncAge(), slack_counts=False)
+    limits = monitor_limits(rig, SyncAge(), slack_counts=False)
     assert limits.max_tension == tension_limits(rig)[1]
     watch = Monitor.fresh(limits, ["a", "b"])
 

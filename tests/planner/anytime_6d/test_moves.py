@@ -16,8 +16,8 @@ from planner.anytime_6d.problem import (
     move_allowed,
     move_length,
     put_between,
+    rotation_between,
     rotations_kept,
-    turn_between,
 )
 from tests.planner.anytime_6d.rotating_scenes import (
     GACHON,
@@ -51,7 +51,7 @@ def test_a_share_of_a_move_is_that_of_the_check_and_the_executor(
     expected = interpolate(start, end, share)
     assert np.allclose(found[:3], expected.position, rtol=0, atol=1e-12)
     assert np.allclose(matrix_of(found), expected.rotation, rtol=0, atol=1e-12)
-    assert np.linalg.norm(turn_between(row(start), row(end))) == pytest.approx(
+    assert np.linalg.norm(rotation_between(row(start), row(end))) == pytest.approx(
         start.angle_to(end), abs=1e-9
     )
 

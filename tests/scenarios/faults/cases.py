@@ -14,16 +14,16 @@ from drivers.cia402.pdo import (
     SDO_REQUEST_BASE,
     SYNC_ID,
     TPDO1_BASE,
-    make_reply,
     make_set_point,
     parse_reply,
 )
 from drivers.cia402.state_machine import ControlWord, DriveState
-from executor.safety.monitor import WatchLimits
+from executor.safety.monitor import MonitorLimits
 from executor.safety.stall import STUCK_CYCLES
 from executor.state_machine import State
 from simulation.drives.behaviour import STRICT, DriveBehaviour, behaviour_named
 from simulation.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
+from tests.drivers.drive_bench import make_reply
 from tests.scenarios.faults.bench import EVERY_ID, Bench, Script, SimulatedBench, a_message, once
 from tests.scenarios.faults.samples import emergencies, left_holding
 
@@ -281,7 +281,7 @@ REPORTED_BY_DRIVE = 3.0
 BELIEVED = 2.0
 """Cycles after a jump that the reply at its SYNC shows: the next one confirms it, then the stop."""
 
-MAY_BE_LATE = WatchLimits(0.0, 0.0, 0.0, 0.0).late_periods
+MAY_BE_LATE = MonitorLimits(0.0, 0.0, 0.0, 0.0).late_periods
 """Lateness that ends no run; a stop that waits for such a cycle is as late."""
 
 

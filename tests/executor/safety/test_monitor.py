@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from executor.safety.fault_messages import Alarm, StopReaction
-from executor.safety.monitor import Monitor, Observation, WatchLimits
+from executor.safety.monitor import Monitor, MonitorLimits, Observation
 
 NAN = float("nan")
-LIMITS = WatchLimits(following_error=0.002, min_tension=5.0, max_tension=100.0, no_tension=0.5)
+LIMITS = MonitorLimits(following_error=0.002, min_tension=5.0, max_tension=100.0, no_tension=0.5)
 FINE = Observation(
     following=True,
     following_errors=(0.0, 0.0, 0.0),
