@@ -16,12 +16,12 @@ from model.files.documents import write_atomic
 from model.files.examples import (
     copy_examples,
     find_examples,
-    ready_folder,
     rig_text,
     select_examples,
 )
 from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
 from model.files.output import require_new_file
+from model.files.reading import ready_folder
 from model.rig import load_rig
 
 
@@ -121,7 +121,8 @@ def new(
     show_line(f"wrote {output}: {answers['cables']} cables")
     rig = load_rig(output)
     Terminal().remarks(rig.document.remarks(), home_remarks(rig))
-    show_line(f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE")
+    plan = f"cdpr plan {name} SCENE -o plan.json"
+    show_line(f"next: review it, then cdpr doctor {name}, and with a scene {plan}")
 
 
 def _ask(question: RigQuestion, default: str) -> str:

@@ -13,15 +13,16 @@ from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.run import supervise
 from cdpr.cli.operate.supervision import handling
-from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
-from cdpr.cli.output import Terminal, out, show_facts, show_line
+from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions, words_of
+from cdpr.cli.output import Terminal, show_facts, show_line
 from cdpr.console.session import Console
 from cdpr.console.verbs import ConsoleFiles
 from executor import runner
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput, HardwareMissing
-from model.files.examples import PAPER_RIG, ready_folder
+from model.files.examples import PAPER_RIG
+from model.files.reading import docs_page, ready_folder
 from model.plan import plan_facts, plan_from_document, save_plan
 from model.rig import load_rig
 from model.scene import load_scene
@@ -67,14 +68,11 @@ def console(
             why="the connection is not encrypted, and anyone with the address can move the robot",
             next_step="use an SSH tunnel, or pass --allow-others on a network that you trust",
         )
-    options = [("--interface", bus.interface), ("--channel", bus.channel)]
     files = ConsoleFiles(
         rig_file=rig,
         rig=bus.rig(rig),
-        bus_options=tuple(text for name, value in options if value for text in (name, value)),
-        calibration_options=tuple(
-            text for path in bus.calibration or () for text in ("--calibration", str(path))
-        ),
+        bus_options=words_of(interface=bus.interface, channel=bus.channel),
+        calibration_options=words_of(calibration=bus.calibration),
         cameras=tuple(camera or ()),
         scene_file=scene,
         without_real_time=without_real_time,
@@ -157,5 +155,5 @@ def demo(
         return
     plan = plan_from_document(document)
     code = supervise(partial(runner.run, plan, rig, folder=folder, realtime=False), rig)
-    out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
+    show_line(f"next: open the report in a browser; your own rig: {docs_page('your-own-rig.md')}")
     raise typer.Exit(code)
