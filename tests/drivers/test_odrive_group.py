@@ -767,6 +767,19 @@ def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     assert reported == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
 
 
+def test_drives_that_report_no_torque_are_not_enabled(bench: OdriveBench) -> None:
+    """All brakes opened, and the first cycle was a fault. State and position can still be read."""
+    for drive in bench.drives[:2]:
+        drive.silent.add("torques")
+    bench.group.configure()
+    with pytest.raises(HardwareMissing, match="no torque from drives 1, 2") as caught:
+        bench.group.read_positions()
+    assert "torques_msg_rate_ms" in caught.value.next_step
+    assert SET_AXIS_STATE not in {node_and_command(m.arbitration_id)[1] for m in bench.frames()}
+    assert bench.group.read_state(lambda: 0.0).state is GroupState.CONFIGURED
+    assert read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump).silent == ()
+
+
 @pytest.mark.parametrize(
     ("kinds", "missing"), [({"heartbeat"}, "heartbeat"), ({"heartbeat", "estimates"}, "position")]
 )
@@ -824,11 +837,15 @@ def test_slow_heartbeats_are_waited_for(heartbeat_ms: int) -> None:
         assert within >= 4.0 * heartbeat_ms / 1000.0
 
 
-def test_the_first_reading_goes_on_until_every_state_is_known() -> None:
+def test_the_first_reading_goes_on_until_every_state_and_torque_is_known() -> None:
     """At 1 ms the positions were complete 20 times before the first heartbeat."""
     rig, layouts = odrive_rig(), read_layouts()
     watch = OdriveMonitor(rig, rig.document.drives, layouts, [1e9] * 8)  # type: ignore[arg-type]
-    sent = [(layouts.heartbeat, (0, 1, 0)), (layouts.get_encoder_estimates, (0.0, 0.0))]
+    sent = [
+        (layouts.heartbeat, (0, 1, 0)),
+        (layouts.get_encoder_estimates, (0.0, 0.0)),
+        (layouts.get_torques, (0.0, 0.0)),
+    ]
     messages = [(can_id(n, each.command), each.pack(*v)) for each, v in sent for n in watch.nodes]
     for number, message in enumerate(messages[1:]):
         assert not watch.complete, f"after {number} messages"
