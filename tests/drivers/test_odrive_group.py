@@ -35,7 +35,7 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
-SET_AXIS_STATE, SET_INPUT_POS = 0x07, 0x0C
+SET_AXIS_STATE, SET_INPUT_POS, GET_IQ = 0x07, 0x0C, 0x14
 HEARTBEAT, ENCODER_ESTIMATES, TORQUES = 0x01, 0x09, 0x1C
 WATCHDOG_S = 0.1
 
@@ -156,6 +156,22 @@ def test_without_a_master_all_are_disarmed_together_by_their_watchdogs(bench: Od
     assert states(bench) == {AxisState.IDLE}
     assert {drive.errors for drive in bench.drives} == {AxisError.WATCHDOG_TIMER_EXPIRED}
     assert [drive.motor.position for drive in bench.drives] == began
+
+
+@pytest.mark.parametrize("fed_by_reads", [True, False])
+def test_without_a_master_those_that_another_program_reads_may_stay_enabled(
+    bench: OdriveBench, fed_by_reads: bool
+) -> None:
+    """Of which kind firmware 0.6 is, is not documented; so the page on ODrives forbids reads."""
+    for drive in bench.drives:
+        drive.settings.fed_by_reads = fed_by_reads
+    bench.enable()
+    for _ in range(10):
+        other_program(bench, 3, GET_IQ, b"", is_remote_frame=True)
+        for _ in range(5):
+            bench.rehearsal.pump()
+    still = [drive.node for drive in bench.drives if drive.state is not AxisState.IDLE]
+    assert still == ([3] if fed_by_reads else [])
 
 
 def test_after_that_a_new_master_finds_them_idle_and_starts_from_where_they_are(
