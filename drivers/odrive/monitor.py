@@ -32,15 +32,26 @@ NEVER = 10**6
 
 Report = Literal["heartbeat", "position", "torque"]
 
-NO_REPORT = (
+_SILENT = (
     "a drive has no power, is not on the bus, or its message periods are longer than in the rig"
     " file",
     "check power, wiring and the message periods",
 )
-NO_TORQUE = (
-    "it is not sent, or less often than in the rig file; without it no tension is measured",
-    "set torques_msg_rate_ms of every drive to drives.torques_ms",
-)
+NO_REPORT: dict[Report, tuple[str, str]] = {
+    "heartbeat": _SILENT,
+    "position": _SILENT,
+    "torque": (
+        "it is not sent, or less often than in the rig file; without it no tension is measured",
+        "set torques_msg_rate_ms of every drive to drives.torques_ms",
+    ),
+}
+NO_NUMBER: dict[Report, tuple[str, str]] = {
+    "position": (
+        "its encoder is not read, or has no absolute reference (absolute_setpoints)",
+        "check the encoder with odrivetool",
+    ),
+    "torque": ("its motor currents are not measured", "check the motor with odrivetool"),
+}
 """Cause and next step."""
 
 
@@ -75,6 +86,7 @@ class OdriveMonitor:
             "torque": math.ceil(document.torques_ms / cycle_ms) + SPARE_CYCLES,
         }
         self._ages = {report: [NEVER] * count for report in self._most}
+        self._not_numbers: set[tuple[Report, int]] = set()
         self._routes: dict[int, tuple[int, Layout, Callable[[int, tuple[float, ...]], None]]] = {}
         for drive, node in enumerate(self.nodes):
             for layout, note in (
@@ -125,6 +137,7 @@ class OdriveMonitor:
         if report == "position":
             self._check.forget_positions()
         self._ages[report] = [NEVER] * len(self.nodes)
+        self._not_numbers -= {(report, drive) for drive in range(len(self.nodes))}
 
     def overdue(self, report: Report) -> list[bool]:
         """True for drives whose last report is too old, or that sent none since `forget`."""
@@ -135,14 +148,15 @@ class OdriveMonitor:
         return not any(any(self.overdue(report)) for report in reports)
 
     def unheard(self, where: str, *reports: Report) -> HardwareMissing:
-        """Error about the first overdue report, with the drives that do not send it."""
+        """Error about the first overdue report, with the drives that send none, or no number."""
         report = next((each for each in reports if not self.heard(each)), reports[0])
-        rows = zip(self.nodes, self.overdue(report), strict=True)
-        silent = [node for node, late in rows if late] or self.nodes
-        names = ", ".join(map(str, silent))
-        why, next_step = NO_TORQUE if report == "torque" else NO_REPORT
+        overdue = [drive for drive, late in enumerate(self.overdue(report)) if late]
+        silent = [drive for drive in overdue if (report, drive) not in self._not_numbers]
+        names = ", ".join(str(self.nodes[drive]) for drive in silent or overdue)
+        no_number = ": it is not a number" if overdue and not silent else ""
+        why, next_step = NO_NUMBER[report] if no_number else NO_REPORT[report]
         return HardwareMissing(
-            f"no {report} from drives {names}",
+            f"no {report} from drives {names or 'all'}{no_number}",
             where=where,
             why=why,
             next_step=next_step,
@@ -230,8 +244,7 @@ class OdriveMonitor:
 
     def _estimate(self, drive: int, values: tuple[float, ...]) -> None:
         turns, _ = values
-        if not math.isfinite(turns):
-            self._check.reject(drive, "its position is not a number")
+        if not self._is_number("position", drive, turns):
             return
         position = round(turns * self._per_turn[drive])
         if self._check.accept(drive, position):
@@ -241,8 +254,14 @@ class OdriveMonitor:
 
     def _torque(self, drive: int, values: tuple[float, ...]) -> None:
         _, torque = values
-        if not math.isfinite(torque):
-            self._check.reject(drive, "its torque is not a number")
-            return
-        self.torques[drive] = torque
-        self._ages["torque"][drive] = 0
+        if self._is_number("torque", drive, torque):
+            self.torques[drive] = torque
+            self._ages["torque"][drive] = 0
+
+    def _is_number(self, report: Report, drive: int, value: float) -> bool:
+        if math.isfinite(value):
+            self._not_numbers.discard((report, drive))
+            return True
+        self._not_numbers.add((report, drive))
+        self._check.reject(drive, f"its {report} is not a number")
+        return False

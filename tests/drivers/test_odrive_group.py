@@ -783,6 +783,25 @@ def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     assert reported == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
 
 
+def test_a_position_that_is_not_a_number_is_not_a_drive_without_power(bench: OdriveBench) -> None:
+    bench.rehearsal._begin_torque_update = lambda: None  # type: ignore[method-assign]  # a NaN has no equilibrium
+    bench.group.configure()
+    bench.drives[2].motor.position = float("nan")
+    for read in (
+        bench.group.read_positions,
+        lambda: read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump),
+    ):
+        with pytest.raises(HardwareMissing) as caught:
+            read()
+        assert caught.value.what == "no position from drives 3: it is not a number"
+        assert "absolute_setpoints" in caught.value.why
+        assert caught.value.next_step == "check the encoder with odrivetool"
+    bench.drives[4].deaf = True
+    with pytest.raises(HardwareMissing, match="no position from drives 5") as caught:
+        bench.group.read_positions()
+    assert "no power" in caught.value.why
+
+
 def test_drives_that_report_no_torque_are_not_enabled(bench: OdriveBench) -> None:
     """All brakes opened, and the first cycle was a fault. State and position can still be read."""
     for drive in bench.drives[:2]:
