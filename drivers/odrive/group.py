@@ -16,7 +16,7 @@ from enum import Enum, auto
 import can
 import numpy as np
 
-from drivers.can_load import HEARTBEATS_WAITED, TESTED_HZ
+from drivers.can_load import TESTED_HZ, heartbeat_within
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
     Capabilities,
@@ -380,11 +380,6 @@ class OdriveGroup(CyclicGroup):
         self._state, self._stop = GroupState.CONFIGURED, _Stop.NONE
         heartbeat = self._document.heartbeat_ms / self._rig.document.bus.cycle_ms
         self._resetting = int(heartbeat) + 2  # until all heartbeats are newer than the reset
-
-
-def heartbeat_within(document: OdriveDocument) -> float:
-    """Longest time until a drive shows a new state, [s]."""
-    return HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
 
 
 def first_attempts(rig: Rig, document: OdriveDocument, pump: Pump | None) -> int:

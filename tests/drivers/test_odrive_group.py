@@ -500,6 +500,19 @@ def test_a_drive_that_reports_its_version_on_its_own_is_refused_by_that_setting(
 
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
     "silent": (lambda b: setattr(b.drives[1], "deaf", True), HardwareMissing, "drive 2: no"),
+    "firmware 0.5": (
+        lambda b: setattr(b.drives[1], "_answer", lambda _command: None),
+        HardwareMissing,
+        r"drive 2: heartbeats, but no Get_Version(.|\n)*firmware 0\.5, as of every ODrive 3\.x",
+    ),
+    "neither version nor heartbeat": (
+        lambda b: (
+            setattr(b.drives[1], "_answer", lambda _command: None),
+            b.drives[1].silent.add("heartbeat"),
+        ),
+        HardwareMissing,
+        "drive 2: no Get_Version",
+    ),
     "no heartbeat": (
         lambda b: b.drives[1].silent.add("heartbeat"),
         HardwareMissing,
