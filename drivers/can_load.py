@@ -88,6 +88,11 @@ def requests_per_cycle(drives: int, cycle: float, bitrate: int) -> int:
     return max(1, int(min(cycle / SDO_PERIOD + 1e-9, free / (2 * frame_bits(_SDO_BYTES)))))
 
 
+def heartbeat_within(settings: OdriveDocument) -> float:
+    """Longest time until an ODrive shows a new state, [s]."""
+    return HEARTBEATS_WAITED * settings.heartbeat_ms / 1000.0
+
+
 def odrive_bus_load(drives: int, cycle: float, bitrate: int, settings: OdriveDocument) -> float:
     """Bus load of ODrives, which send estimates, torques and heartbeats periodically."""
     periods = (

@@ -15,6 +15,9 @@ import can
 from drivers.drive_group import DriveGroup, DriveSnapshot, Pump
 from model.rig import Rig
 
+STOPS_ALONE_WITHIN = 1.0
+"""Least time for drives that lost their master to notice and come to rest, [s]."""
+
 
 def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     """Text of the status words of a `CycleStatus`."""
@@ -67,17 +70,30 @@ def drive_flags(rig: Rig, status_words: Sequence[int]) -> tuple[DriveFlags, ...]
 def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     """Whether drives are in the state expected after the loss of their master.
 
-    CiA 402 drives are then in quick stop under torque; ODrives are disarmed, and a brake holds.
+    CiA 402 drives are then in quick stop under torque; ODrives are idle, and a brake holds.
 
     Args:
         rig: The robot.
         status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":
-        return (True,) * len(status_words)
+        from drivers.odrive.messages import AxisState, state_in
+
+        return tuple(state_in(word) == AxisState.IDLE for word in status_words)
     from drivers.cia402.state_machine import DriveState, state_of
 
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
+
+
+def time_to_stop_alone(rig: Rig) -> float:
+    """Time until drives that lost their master are at rest and report it, [s].
+
+    ODrives follow their last set-point until the watchdog expires; their next heartbeat shows it.
+    """
+    drives = rig.document.drives
+    if drives.type != "odrive":
+        return STOPS_ALONE_WITHIN
+    return max(STOPS_ALONE_WITHIN, ((drives.watchdog_ms or 0.0) + drives.heartbeat_ms) / 1000.0)
 
 
 def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:

@@ -23,6 +23,7 @@ from drivers.factory import (
     make_drive_group,
     read_drives,
     stop_alone,
+    time_to_stop_alone,
 )
 from executor.control.preconditions import configuration_at_rest, require_below, with_counts_at
 from executor.control.standstill import is_braked
@@ -48,9 +49,6 @@ if TYPE_CHECKING:
 #: Buses whose drives are simulated in this process at the moment, of any thread.
 _simulated: set[str] = set()
 _simulating = threading.Lock()
-
-#: Time for drives that lost their master to notice and come to rest, [s].
-ALONE = 1.0
 
 
 def is_simulated(rig: Rig) -> bool:
@@ -194,7 +192,7 @@ def abandoned_drives_fault(document: RigDocument, released: Collection[int]) -> 
     rig = rig_from_document(document)
     if is_simulated(rig):
         return ""
-    time.sleep(ALONE)
+    time.sleep(time_to_stop_alone(rig))
     try:
         snapshot = read_snapshot(rig, rig.home, empty_scene(rig).load)
     except CdprError as error:

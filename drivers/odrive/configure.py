@@ -26,7 +26,7 @@ from drivers.can_errors import (
     moved_by_another,
     wrong_setting,
 )
-from drivers.can_load import HEARTBEATS_WAITED
+from drivers.can_load import heartbeat_within
 from drivers.drive_group import Pump
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
 from drivers.odrive.messages import (
@@ -198,7 +198,7 @@ def configure_drives(
         read_endpoints(Path(document.endpoints), document, layouts) if document.endpoints else None
     )
     link = SetupLink(bus, pump, layouts, nodes)
-    _check_versions(link, layouts, nodes, known)
+    _check_versions(link, layouts, nodes, document, known)
     _check_idle(link, layouts, nodes, document, to_reset)
     _check_supply(link, layouts, nodes)
     if known is not None:
@@ -297,6 +297,7 @@ def _answers(
     *,
     asked: bool,
     once: bool = False,
+    alive: tuple[Layout, float] | None = None,
 ) -> Answers:
     """One message from every drive.
 
@@ -307,6 +308,7 @@ def _answers(
         timeout: Time for all of them, [s].
         asked: The message was requested; otherwise drives send it on their own.
         once: No drive may send it twice.
+        alive: Message that shows which silent drives are there, and the time to wait for it, [s].
 
     Raises:
         HardwareMissing: A drive sent none.
@@ -320,6 +322,9 @@ def _answers(
             received[node] = values
         if len(received) == len(nodes):
             return received
+    there = {node for node, _ in link.answers(*alive)} if alive else set()
+    if old := ", ".join(str(node) for node in nodes if node in there and node not in received):
+        raise _no_version(old)
     silent = ", ".join(str(node) for node in nodes if node not in received)
     adapter = ", or an adapter without remote frames" if asked else ""
     raise HardwareMissing(
@@ -333,14 +338,30 @@ def _answers(
     )
 
 
+def _no_version(nodes: str) -> HardwareMissing:
+    return HardwareMissing(
+        f"drive{'s' if ',' in nodes else ''} {nodes}: heartbeats, but no Get_Version",
+        where=SETTING_UP,
+        why="firmware 0.5, as of every ODrive 3.x, or an adapter without remote frames",
+        next_step="use ODrive Pro, S1 or Micro, as 3.x has no firmware 0.6; if these are in use,"
+        " check the adapter",
+        values={"nodes": nodes},
+    )
+
+
 def _check_versions(
-    link: SetupLink, layouts: Layouts, nodes: Sequence[int], known: Endpoints | None
+    link: SetupLink,
+    layouts: Layouts,
+    nodes: Sequence[int],
+    document: OdriveDocument,
+    known: Endpoints | None,
 ) -> None:
     """Checks that every drive answers once, with a supported firmware and the known board."""
     for node in nodes:
         link.ask(node, layouts.get_version)
-    versions = _answers(link, layouts.get_version, nodes, RESPONSE_TIMEOUT, asked=True, once=True)
-    for node, _ in link.answers(layouts.get_version, ECHO_WAIT):
+    layout, alive = layouts.get_version, (layouts.heartbeat, heartbeat_within(document))
+    versions = _answers(link, layout, nodes, RESPONSE_TIMEOUT, asked=True, once=True, alive=alive)
+    for node, _ in link.answers(layout, ECHO_WAIT):
         if node in nodes:
             raise answers_twice(node, *SENT_CYCLICALLY)
     for node, (_, *numbers) in versions.items():
@@ -355,31 +376,14 @@ def _check_versions(
                 values={"node": node, "firmware": text},
             )
         if known is not None:
-            _require_version(node, "firmware", firmware, known.firmware)
-            _require_version(node, "board", board, known.board)
-
-
-def _require_version(
-    node: int, kind: str, version: tuple[int, ...], described: tuple[int, ...]
-) -> None:
-    """Requires the firmware or board that the file of endpoints describes."""
-    if version != described:
-        text, wanted = (".".join(map(str, numbers)) for numbers in (version, described))
-        raise Refused(
-            f"its {kind} is {text}, drives.endpoints is for {wanted}",
-            where=f"drive {node}",
-            why=f"endpoint numbers differ between {kind} versions",
-            next_step=f"use the flat_endpoints.json of the drive's {kind}, or leave out"
-            " drives.endpoints if the drives differ",
-            values={"node": node, kind: text},
-        )
+            known.require(node, board, firmware)
 
 
 def _check_idle(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], document: OdriveDocument, reset: bool
 ) -> None:
     """Checks that no drive is enabled or busy; another program controls an enabled one."""
-    wait = HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
+    wait = heartbeat_within(document)
     heartbeats = _answers(link, layouts.heartbeat, nodes, wait, asked=False)
     for node, (_, state, _) in heartbeats.items():
         if state != AxisState.IDLE:

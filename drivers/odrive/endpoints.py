@@ -15,7 +15,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from drivers.odrive.messages import Layouts
-from model.errors import BadInput
+from model.errors import BadInput, Refused
 from model.files.reading import read_json
 from model.files.rig_file import OdriveDocument
 
@@ -112,6 +112,25 @@ class Endpoints:
     firmware: tuple[int, int, int]
     board: tuple[int, int, int]
     by_name: dict[str, Endpoint]
+
+    def require(self, node: int, board: tuple[int, ...], firmware: tuple[int, ...]) -> None:
+        """Requires a drive of this firmware and board.
+
+        Raises:
+            Refused: It has another one.
+        """
+        rows = (("firmware", firmware, self.firmware), ("board", board, self.board))
+        for kind, version, described in rows:
+            if version != described:
+                text, wanted = (".".join(map(str, numbers)) for numbers in (version, described))
+                raise Refused(
+                    f"its {kind} is {text}, drives.endpoints is for {wanted}",
+                    where=f"drive {node}",
+                    why=f"endpoint numbers differ between {kind} versions",
+                    next_step=f"use the flat_endpoints.json of the drive's {kind}, or leave out"
+                    " drives.endpoints if the drives differ",
+                    values={"node": node, kind: text},
+                )
 
 
 def wanted_settings(document: OdriveDocument, layouts: Layouts) -> tuple[Wanted, ...]:

@@ -16,7 +16,7 @@ from enum import Enum, auto
 import can
 import numpy as np
 
-from drivers.can_load import HEARTBEATS_WAITED, TESTED_HZ
+from drivers.can_load import TESTED_HZ, heartbeat_within
 from drivers.cyclic_group import CyclicBus, CyclicGroup
 from drivers.drive_group import (
     Capabilities,
@@ -40,7 +40,7 @@ from drivers.odrive.messages import (
     read_layouts,
     state_text,
 )
-from drivers.odrive.monitor import OdriveMonitor
+from drivers.odrive.monitor import OdriveMonitor, Report
 from drivers.plausibility import largest_steps, winding_signs
 from model.errors import HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
@@ -160,12 +160,16 @@ class OdriveGroup(CyclicGroup):
         """Waits until every drive has reported position and state; see `DriveGroup`.
 
         ODrives report on their own, so nothing is sent; ``pace`` only shows the supervisor that
-        this process is alive.
+        this process is alive. Their torques are required too: an enabled drive without them is a
+        fault.
         """
+        return self._read(pace, "position", "heartbeat", "torque")
+
+    def _read(self, pace: Pace | None, *reports: Report) -> CycleStatus:
         self._online()
         self._cyclic.forget_waiting()
-        self._watch.forget_positions()
-        self._watch.forget_heartbeats()
+        for report in reports:
+            self._watch.forget(report)
         agreed = 0
         for _ in range(first_attempts(self._rig, self._document, self._pump)):
             if pace is not None and self._pump is None:
@@ -173,19 +177,10 @@ class OdriveGroup(CyclicGroup):
             self._watch.begin_cycle()
             status = self.receive(FIRST_READING_TIMEOUT)
             agreed = 0 if status.missing.any() else agreed + 1
-            if agreed >= FIRST_READINGS and self._watch.states_known:
+            if agreed >= FIRST_READINGS and self._watch.heard(*reports):
                 self._recent.clear()
                 return status
-        silent = [n for n, gone in zip(self._nodes, self._watch.missing, strict=True) if gone]
-        names = ", ".join(map(str, silent or self._nodes))
-        raise HardwareMissing(
-            f"no {'position' if silent else 'heartbeat'} from drives {names}",
-            where="reading the drives' positions",
-            why="a drive lost power or the bus, or its message periods are longer than in the rig"
-            " file",
-            next_step="check power, wiring and the message periods, then start again",
-            values={"nodes": names},
-        )
+        raise self._watch.unheard("reading the drives' positions", *reports)
 
     def send_cycle(
         self, targets: Sequence[int], may_send: Callable[[bool], bool] = lambda _enables: True
@@ -251,7 +246,7 @@ class OdriveGroup(CyclicGroup):
 
     def read_state(self, pace: Pace) -> CycleStatus:
         """Reads positions and states again; see `DriveGroup.read_state`."""
-        return self.read_positions(pace)
+        return self._read(pace, "position", "heartbeat")
 
     def _arm(self) -> None:
         """Arms all drives once, and again those whose watchdog expired before they were fed.
@@ -305,7 +300,7 @@ class OdriveGroup(CyclicGroup):
         """Checks whether the transition in progress has finished or timed out."""
         if self._stop is _Stop.HOLDING and self._waited >= self._settling:
             self._stop, self._waited = _Stop.DISARMING, 0
-            self._watch.forget_heartbeats()
+            self._watch.forget("heartbeat")
         elif self._stop is _Stop.DISARMING and self._waited > 0:
             if self._all_disarmed() or self._waited > self._patience:
                 self._stop = _Stop.OVER
@@ -318,7 +313,7 @@ class OdriveGroup(CyclicGroup):
             self._state = GroupState.RELEASED
 
     def _all_disarmed(self) -> bool:
-        return self._watch.states_known and not self._watch.any_enabled()
+        return self._watch.heard("heartbeat") and not self._watch.any_enabled()
 
     def _not_enabled(self) -> list[tuple[int, str]]:
         watch = self._watch
@@ -387,11 +382,6 @@ class OdriveGroup(CyclicGroup):
         self._resetting = int(heartbeat) + 2  # until all heartbeats are newer than the reset
 
 
-def heartbeat_within(document: OdriveDocument) -> float:
-    """Longest time until a drive shows a new state, [s]."""
-    return HEARTBEATS_WAITED * document.heartbeat_ms / 1000.0
-
-
 def first_attempts(rig: Rig, document: OdriveDocument, pump: Pump | None) -> int:
     """Number of attempts to hear all drives; each lasts `FIRST_READING_TIMEOUT` or one ``pump``."""
     attempt = FIRST_READING_TIMEOUT if pump is None else rig.cycle
@@ -418,21 +408,13 @@ def read_axes(
         cyclic.take_replies(watch, FIRST_READING_TIMEOUT if pump is None else 0.0)
         cyclic.end_cycle()
         watch.end_cycle()
-        if watch.states_known and not any(watch.missing):
+        if watch.heard("position", "heartbeat"):
             break
     else:
-        mute = watch.missing if any(watch.missing) else watch.stateless
-        silence = HardwareMissing(
-            f"no {'position' if any(watch.missing) else 'heartbeat'} from drives"
-            f" {', '.join(str(n) for n, gone in zip(nodes, mute, strict=True) if gone)}",
-            where="listening to the drives",
-            why="a drive has no power, is not on the bus, or its message periods are longer"
-            " than in the rig file",
-            next_step="check power, wiring and the message periods",
-        )
+        silence = watch.unheard("listening to the drives", "position", "heartbeat")
         if not partial:
             raise silence
-    heard = ~(np.array(watch.missing) | watch.stateless)
+    heard = ~(np.array(watch.missing) | watch.overdue("heartbeat"))
     per_mille = winding_signs(rig) * 1000.0 / [winch.rated_torque for winch in rig.winches]
     return DriveSnapshot(
         positions=np.array(watch.positions, dtype=np.int64)[heard],

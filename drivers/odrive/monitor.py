@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Container, Sequence
+from typing import Literal
 
 from drivers.can_load import HEARTBEATS_WAITED
 from drivers.odrive.messages import (
@@ -16,6 +17,7 @@ from drivers.odrive.messages import (
     status_word,
 )
 from drivers.plausibility import ReplyCheck
+from model.errors import HardwareMissing
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
@@ -27,6 +29,30 @@ MISSED_TORQUES = 3
 positions."""
 
 NEVER = 10**6
+
+Report = Literal["heartbeat", "position", "torque"]
+
+_SILENT = (
+    "a drive has no power, is not on the bus, or its message periods are longer than in the rig"
+    " file",
+    "check power, wiring and the message periods",
+)
+NO_REPORT: dict[Report, tuple[str, str]] = {
+    "heartbeat": _SILENT,
+    "position": _SILENT,
+    "torque": (
+        "it is not sent, or less often than in the rig file; without it no tension is measured",
+        "set torques_msg_rate_ms of every drive to drives.torques_ms",
+    ),
+}
+NO_NUMBER: dict[Report, tuple[str, str]] = {
+    "position": (
+        "its encoder is not read, or has no absolute reference (absolute_setpoints)",
+        "check the encoder with odrivetool",
+    ),
+    "torque": ("its motor currents are not measured", "check the motor with odrivetool"),
+}
+"""Cause and next step."""
 
 
 class OdriveMonitor:
@@ -53,13 +79,14 @@ class OdriveMonitor:
         self._check = ReplyCheck(rig.drive_names, max_steps)
         self._fresh = [False] * count
         self._layouts = layouts
-        # Cycles since the last message of each kind, and their limits.
-        self._ages = {kind: [NEVER] * count for kind in ("heartbeat", "position", "torque")}
-        self._most = {
+        # Limits of the cycles since the last message of each kind, and these cycles.
+        self._most: dict[Report, int] = {
             "heartbeat": math.ceil(HEARTBEATS_WAITED * document.heartbeat_ms / cycle_ms),
             "position": math.ceil(document.estimates_ms / cycle_ms) + SPARE_CYCLES,
             "torque": math.ceil(document.torques_ms / cycle_ms) + SPARE_CYCLES,
         }
+        self._ages = {report: [NEVER] * count for report in self._most}
+        self._not_numbers: set[tuple[Report, int]] = set()
         self._routes: dict[int, tuple[int, Layout, Callable[[int, tuple[float, ...]], None]]] = {}
         for drive, node in enumerate(self.nodes):
             for layout, note in (
@@ -81,13 +108,13 @@ class OdriveMonitor:
 
     @property
     def complete(self) -> bool:
-        """Whether every drive has reported a position in this cycle, and its state is known."""
-        return all(self._fresh) and self.states_known
+        """Whether all reported a position in this cycle, and their states and torques are known."""
+        return all(self._fresh) and self.heard("heartbeat", "torque")
 
     @property
     def missing(self) -> list[bool]:
         """True for drives whose last position is too old."""
-        return [age > self._most["position"] for age in self._ages["position"]]
+        return self.overdue("position")
 
     @property
     def status_words(self) -> list[int]:
@@ -105,24 +132,36 @@ class OdriveMonitor:
         for ages in self._ages.values():
             ages[:] = [age + 1 for age in ages]
 
-    def forget_positions(self) -> None:
-        """Accepts any next positions, as the drives may have been moved."""
-        self._check.forget_positions()
-        self._ages["position"] = [NEVER] * len(self.nodes)
+    def forget(self, report: Report) -> None:
+        """Ignores the reports so far; any next position counts, as the drives may have moved."""
+        if report == "position":
+            self._check.forget_positions()
+        self._ages[report] = [NEVER] * len(self.nodes)
+        self._not_numbers -= {(report, drive) for drive in range(len(self.nodes))}
 
-    def forget_heartbeats(self) -> None:
-        """Ignores the states reported so far."""
-        self._ages["heartbeat"] = [NEVER] * len(self.nodes)
+    def overdue(self, report: Report) -> list[bool]:
+        """True for drives whose last report is too old, or that sent none since `forget`."""
+        return [age > self._most[report] for age in self._ages[report]]
 
-    @property
-    def states_known(self) -> bool:
-        """Whether every drive has sent a heartbeat since `forget_heartbeats`, none overdue."""
-        return not any(self.stateless)
+    def heard(self, *reports: Report) -> bool:
+        """Whether none of these reports of any drive is overdue."""
+        return not any(any(self.overdue(report)) for report in reports)
 
-    @property
-    def stateless(self) -> list[bool]:
-        """True for drives whose heartbeat is overdue, so that their state is unknown."""
-        return [age > self._most["heartbeat"] for age in self._ages["heartbeat"]]
+    def unheard(self, where: str, *reports: Report) -> HardwareMissing:
+        """Error about the first overdue report, with the drives that send none, or no number."""
+        report = next((each for each in reports if not self.heard(each)), reports[0])
+        overdue = [drive for drive, late in enumerate(self.overdue(report)) if late]
+        silent = [drive for drive in overdue if (report, drive) not in self._not_numbers]
+        names = ", ".join(str(self.nodes[drive]) for drive in silent or overdue)
+        no_number = ": it is not a number" if overdue and not silent else ""
+        why, next_step = NO_NUMBER[report] if no_number else NO_REPORT[report]
+        return HardwareMissing(
+            f"no {report} from drives {names or 'all'}{no_number}",
+            where=where,
+            why=why,
+            next_step=next_step,
+            values={"nodes": names},
+        )
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
         """Processes one frame; drives send asynchronously, so the newest always counts."""
@@ -205,8 +244,7 @@ class OdriveMonitor:
 
     def _estimate(self, drive: int, values: tuple[float, ...]) -> None:
         turns, _ = values
-        if not math.isfinite(turns):
-            self._check.reject(drive, "its position is not a number")
+        if not self._is_number("position", drive, turns):
             return
         position = round(turns * self._per_turn[drive])
         if self._check.accept(drive, position):
@@ -216,8 +254,14 @@ class OdriveMonitor:
 
     def _torque(self, drive: int, values: tuple[float, ...]) -> None:
         _, torque = values
-        if not math.isfinite(torque):
-            self._check.reject(drive, "its torque is not a number")
-            return
-        self.torques[drive] = torque
-        self._ages["torque"][drive] = 0
+        if self._is_number("torque", drive, torque):
+            self.torques[drive] = torque
+            self._ages["torque"][drive] = 0
+
+    def _is_number(self, report: Report, drive: int, value: float) -> bool:
+        if math.isfinite(value):
+            self._not_numbers.discard((report, drive))
+            return True
+        self._not_numbers.add((report, drive))
+        self._check.reject(drive, f"its {report} is not a number")
+        return False

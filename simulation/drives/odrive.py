@@ -5,8 +5,9 @@ the axis is disarmed, by the master, its watchdog or an error, the torque is rem
 closes.
 
 Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Assumptions where it is not specific:
-the watchdog runs while the axis is enabled (`OdriveSettings.watchdog_at_rest` changes that); errors
-prevent enabling.
+the watchdog runs while the axis is enabled (`OdriveSettings.watchdog_at_rest` changes that); every
+frame to the drive feeds it, reads too, as in firmware 0.5 (`OdriveSettings.fed_by_reads`; source:
+ODrive, Firmware/communication/can/can_simple.cpp, do_command); errors prevent enabling.
 """
 
 from __future__ import annotations
@@ -56,11 +57,12 @@ class OdriveSettings:
     """Non-volatile settings of a drive, as written with odrivetool.
 
     Attributes:
-        watchdog: Time without a set-point after which the axis is disarmed, [s]; None when off.
+        watchdog: Time without being fed after which the axis is disarmed, [s]; None when off.
         heartbeat: Period, [s].
         estimates: Period, [s].
         torques: Period, [s].
         watchdog_at_rest: The watchdog also runs while the axis is idle, as in firmware 0.5.
+        fed_by_reads: Every frame feeds the watchdog; otherwise only set-points and states do.
         firmware: Major, minor, revision.
         board: Product line, version, variant.
         values: Other endpoints by number, as four raw bytes.
@@ -72,6 +74,7 @@ class OdriveSettings:
     estimates: float
     torques: float
     watchdog_at_rest: bool = False
+    fed_by_reads: bool = True
     firmware: tuple[int, int, int] = (0, 6, 11)
     board: tuple[int, int, int] = (4, 4, 58)
     values: dict[int, int] = field(default_factory=dict)
@@ -176,6 +179,8 @@ class SimulatedOdrive:
         """Processes a frame for this drive."""
         if self.deaf:
             return
+        if self.settings.fed_by_reads:
+            self._unfed = 0.0
         if not data:
             self._answer(command)
         elif command == self._layouts.rxsdo.command:

@@ -35,7 +35,7 @@ from model.files.rig_file import OdriveDocument
 from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
-SET_AXIS_STATE, SET_INPUT_POS = 0x07, 0x0C
+SET_AXIS_STATE, SET_INPUT_POS, GET_IQ = 0x07, 0x0C, 0x14
 HEARTBEAT, ENCODER_ESTIMATES, TORQUES = 0x01, 0x09, 0x1C
 WATCHDOG_S = 0.1
 
@@ -156,6 +156,22 @@ def test_without_a_master_all_are_disarmed_together_by_their_watchdogs(bench: Od
     assert states(bench) == {AxisState.IDLE}
     assert {drive.errors for drive in bench.drives} == {AxisError.WATCHDOG_TIMER_EXPIRED}
     assert [drive.motor.position for drive in bench.drives] == began
+
+
+@pytest.mark.parametrize("fed_by_reads", [True, False])
+def test_without_a_master_those_that_another_program_reads_may_stay_enabled(
+    bench: OdriveBench, fed_by_reads: bool
+) -> None:
+    """Of which kind firmware 0.6 is, is not documented; so the page on ODrives forbids reads."""
+    for drive in bench.drives:
+        drive.settings.fed_by_reads = fed_by_reads
+    bench.enable()
+    for _ in range(10):
+        other_program(bench, 3, GET_IQ, b"", is_remote_frame=True)
+        for _ in range(5):
+            bench.rehearsal.pump()
+    still = [drive.node for drive in bench.drives if drive.state is not AxisState.IDLE]
+    assert still == ([3] if fed_by_reads else [])
 
 
 def test_after_that_a_new_master_finds_them_idle_and_starts_from_where_they_are(
@@ -484,6 +500,19 @@ def test_a_drive_that_reports_its_version_on_its_own_is_refused_by_that_setting(
 
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
     "silent": (lambda b: setattr(b.drives[1], "deaf", True), HardwareMissing, "drive 2: no"),
+    "firmware 0.5": (
+        lambda b: setattr(b.drives[1], "_answer", lambda _command: None),
+        HardwareMissing,
+        r"drive 2: heartbeats, but no Get_Version(.|\n)*firmware 0\.5, as of every ODrive 3\.x",
+    ),
+    "neither version nor heartbeat": (
+        lambda b: (
+            setattr(b.drives[1], "_answer", lambda _command: None),
+            b.drives[1].silent.add("heartbeat"),
+        ),
+        HardwareMissing,
+        "drive 2: no Get_Version",
+    ),
     "no heartbeat": (
         lambda b: b.drives[1].silent.add("heartbeat"),
         HardwareMissing,
@@ -767,6 +796,38 @@ def test_reading_alone_sends_nothing(bench: OdriveBench) -> None:
     assert reported == {HEARTBEAT, ENCODER_ESTIMATES, TORQUES}
 
 
+def test_a_position_that_is_not_a_number_is_not_a_drive_without_power(bench: OdriveBench) -> None:
+    bench.rehearsal._begin_torque_update = lambda: None  # type: ignore[method-assign]  # a NaN has no equilibrium
+    bench.group.configure()
+    bench.drives[2].motor.position = float("nan")
+    for read in (
+        bench.group.read_positions,
+        lambda: read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump),
+    ):
+        with pytest.raises(HardwareMissing) as caught:
+            read()
+        assert caught.value.what == "no position from drives 3: it is not a number"
+        assert "absolute_setpoints" in caught.value.why
+        assert caught.value.next_step == "check the encoder with odrivetool"
+    bench.drives[4].deaf = True
+    with pytest.raises(HardwareMissing, match="no position from drives 5") as caught:
+        bench.group.read_positions()
+    assert "no power" in caught.value.why
+
+
+def test_drives_that_report_no_torque_are_not_enabled(bench: OdriveBench) -> None:
+    """All brakes opened, and the first cycle was a fault. State and position can still be read."""
+    for drive in bench.drives[:2]:
+        drive.silent.add("torques")
+    bench.group.configure()
+    with pytest.raises(HardwareMissing, match="no torque from drives 1, 2") as caught:
+        bench.group.read_positions()
+    assert "torques_msg_rate_ms" in caught.value.next_step
+    assert SET_AXIS_STATE not in {node_and_command(m.arbitration_id)[1] for m in bench.frames()}
+    assert bench.group.read_state(lambda: 0.0).state is GroupState.CONFIGURED
+    assert read_drives(bench.rig, bench.group._bus, bench.rehearsal.pump).silent == ()
+
+
 @pytest.mark.parametrize(
     ("kinds", "missing"), [({"heartbeat"}, "heartbeat"), ({"heartbeat", "estimates"}, "position")]
 )
@@ -824,11 +885,15 @@ def test_slow_heartbeats_are_waited_for(heartbeat_ms: int) -> None:
         assert within >= 4.0 * heartbeat_ms / 1000.0
 
 
-def test_the_first_reading_goes_on_until_every_state_is_known() -> None:
+def test_the_first_reading_goes_on_until_every_state_and_torque_is_known() -> None:
     """At 1 ms the positions were complete 20 times before the first heartbeat."""
     rig, layouts = odrive_rig(), read_layouts()
     watch = OdriveMonitor(rig, rig.document.drives, layouts, [1e9] * 8)  # type: ignore[arg-type]
-    sent = [(layouts.heartbeat, (0, 1, 0)), (layouts.get_encoder_estimates, (0.0, 0.0))]
+    sent = [
+        (layouts.heartbeat, (0, 1, 0)),
+        (layouts.get_encoder_estimates, (0.0, 0.0)),
+        (layouts.get_torques, (0.0, 0.0)),
+    ]
     messages = [(can_id(n, each.command), each.pack(*v)) for each, v in sent for n in watch.nodes]
     for number, message in enumerate(messages[1:]):
         assert not watch.complete, f"after {number} messages"

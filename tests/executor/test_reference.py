@@ -14,6 +14,7 @@ import pytest
 from drivers.can_errors import BusDown, TorqueLost
 from drivers.cia402.group import Cia402Group
 from drivers.drive_group import DriveSnapshot
+from drivers.odrive.messages import AxisState, status_word
 from drivers.plausibility import require_within_limits
 from executor import drives
 from executor.control import path_runs
@@ -33,6 +34,9 @@ from model.errors import BadInput, Refused, StoppedByOperator
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from tests.cli.plans import RIG
+from tests.drivers.odrive_bench import odrive_rig
+
+CHANNEL = "239.74.163.99"
 
 
 @pytest.fixture(autouse=True)
@@ -44,7 +48,7 @@ def own_state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def rig_with(encoder: str, **winch: object) -> Rig:
     document = load_rig(RIG).document
     winches = [w.model_copy(update={"encoder": encoder, **winch}) for w in document.winches]
-    bus = document.bus.model_copy(update={"interface": "udp_multicast", "channel": "239.74.163.99"})
+    bus = document.bus.model_copy(update={"interface": "udp_multicast", "channel": CHANNEL})
     return rig_from_document(document.model_copy(update={"winches": winches, "bus": bus}))
 
 
@@ -557,11 +561,30 @@ def test_abandoned_drives_must_hold_unless_they_were_never_enabled(
     rig = rig_with("incremental", brake=True)
     seen = seen_at(rig, words={2: word, 4: word})
     monkeypatch.setattr(drives, "read_snapshot", lambda *_: seen)
-    monkeypatch.setattr(drives, "ALONE", 0.0)
+    monkeypatch.setattr(drives, "time_to_stop_alone", lambda _rig: 0.0)
     assert drives.abandoned_drives_fault(rig.document, (2, 4)) == ""
     found = drives.abandoned_drives_fault(rig.document, (2,))
     assert "cable 4 (drive 4) is in" in found
     assert "drive 2" not in found
+
+
+@pytest.mark.parametrize(("watchdog_ms", "waits"), [(100, 1.0), (1000, 1.05)])
+def test_abandoned_odrives_that_no_watchdog_has_disarmed_do_not_hold(
+    monkeypatch: pytest.MonkeyPatch, watchdog_ms: float, waits: float
+) -> None:
+    """They follow their last set-point; brakes close only when they are idle."""
+    rig = odrive_rig(watchdog_ms=watchdog_ms, heartbeat_ms=50).with_bus("udp_multicast", CHANNEL)
+    words = dict.fromkeys(rig.drive_names, status_word(AxisState.IDLE, 0))
+    words[3] = status_word(AxisState.IDLE, 0x2000)
+    waited: list[float] = []
+    monkeypatch.setattr(drives.time, "sleep", waited.append)
+    monkeypatch.setattr(drives, "read_snapshot", lambda *_: seen_at(rig, words=words))
+    assert drives.abandoned_drives_fault(rig.document, ()) == ""
+    words[4] = status_word(AxisState.CLOSED_LOOP_CONTROL, 0)
+    found = drives.abandoned_drives_fault(rig.document, ())
+    text = "drives do not hold on their own: cable 4 (drive 4) is in closed loop control"
+    assert found == text
+    assert waited == [waits, waits]
 
 
 def _notices_power_cycle(interlock: MotionInterlock) -> None:
