@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import pwd
+import re
 import resource
 import socket
 import sys
@@ -15,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
@@ -122,21 +123,34 @@ def own_packages() -> list[MachineCheck]:
 
 
 def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
-    """Whether every library can be imported, and its version.
+    """Whether every library can be imported, and is as new as required.
 
     Args:
         packages: Distributions by module, as `LIBRARIES`.
     """
+    lines: list[str] = []
+    with suppress(PackageNotFoundError):  # ours may be used without an installation
+        lines += requires("cdpr") or []
+    lowest: dict[str, str] = dict(re.findall(r"(?m)^([\w.-]+)>=([\d.]+)", "\n".join(lines)))
     checks = []
     for module, package in packages.items():
         try:
-            import_module(module)
-            checks.append(MachineCheck(package, True, version(package)))
+            own, found = getattr(import_module(module), "__version__", ""), version(package)
+            if module == "cv2" and not found.startswith(own):
+                found = own  # another distribution of OpenCV replaced the files of this one
+            checks.append(_library(package, found, lowest.get(package, "0")))
         except Exception as error:  # any: the module's own code runs, and may be damaged
             absent = isinstance(error, ModuleNotFoundError)
             fix = f"pip install {'' if absent else '--force-reinstall '}{package}"
             checks.append(MachineCheck(package, False, str(error), fix))
     return checks
+
+
+def _library(package: str, found: str, lowest: str) -> MachineCheck:
+    release, bound = ([int(n) for n in re.findall(r"\d+", text)] for text in (found, lowest))
+    text = found if release >= bound else f"{found}; {lowest} or newer is required"
+    fix = f"pip install --force-reinstall --no-deps '{package}>={lowest}'"
+    return MachineCheck(package, release >= bound, text, fix)
 
 
 def machine() -> list[MachineCheck]:
