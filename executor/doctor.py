@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import pwd
+import re
 import resource
 import socket
 import sys
@@ -15,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
@@ -31,13 +32,8 @@ from drivers.can_interfaces import (
 )
 from executor.cameras.sources import parse_camera_sources
 from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, PRIORITY, has_capability
-from model.errors import BadInput, CdprError, InvalidFile, distinct_figures, without_passwords
-from model.kinematics import NoCable
+from model.errors import BadInput, CdprError, InvalidFile, without_passwords
 from model.rig import Camera, Rig
-from model.scene import empty_scene
-from model.statics.gravity import working_tensions
-from model.statics.tension_distribution import TensionInfeasible
-from planner.settings import CLEARANCE_RESERVE
 
 if TYPE_CHECKING:
     from drivers.can_bus import BusSettings
@@ -140,21 +136,34 @@ def own_packages() -> list[MachineCheck]:
 
 
 def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
-    """Whether every library can be imported, and its version.
+    """Whether every library can be imported, and is as new as required.
 
     Args:
         packages: Distributions by module, as `LIBRARIES`.
     """
+    lines: list[str] = []
+    with suppress(PackageNotFoundError):  # ours may be used without an installation
+        lines += requires("cdpr") or []
+    lowest: dict[str, str] = dict(re.findall(r"(?m)^([\w.-]+)>=([\d.]+)", "\n".join(lines)))
     checks = []
     for module, package in packages.items():
         try:
-            import_module(module)
-            checks.append(MachineCheck(package, True, version(package)))
+            own, found = getattr(import_module(module), "__version__", ""), version(package)
+            if module == "cv2" and not found.startswith(own):
+                found = own  # another distribution of OpenCV replaced the files of this one
+            checks.append(_library(package, found, lowest.get(package, "0")))
         except Exception as error:  # any: the module's own code runs, and may be damaged
             absent = isinstance(error, ModuleNotFoundError)
             fix = f"pip install {'' if absent else '--force-reinstall '}{package}"
             checks.append(MachineCheck(package, False, str(error), fix))
     return checks
+
+
+def _library(package: str, found: str, lowest: str) -> MachineCheck:
+    release, bound = ([int(n) for n in re.findall(r"\d+", text)] for text in (found, lowest))
+    text = found if release >= bound else f"{found}; {lowest} or newer is required"
+    fix = f"pip install --force-reinstall --no-deps '{package}>={lowest}'"
+    return MachineCheck(package, release >= bound, text, fix)
 
 
 def machine() -> list[MachineCheck]:
@@ -257,28 +266,10 @@ def _unstated_gamma(rig: Rig, camera: Camera) -> str:
 
 
 def home_remarks(rig: Rig) -> list[str]:
-    """Why the cables cannot hold the platform at home, or are too near to each other or to it there.
+    """Why no motion can begin at home; empty if one can."""
+    from planner.endpoints import unusable_home  # needs python-fcl
 
-    Too near is what a scene refuses by default. Empty if a motion can begin at home.
-    """
-    from model.clearance import ClearanceModel  # needs python-fcl
-
-    try:
-        working_tensions(rig, rig.home)
-    except (NoCable, TensionInfeasible) as error:
-        return [f"platform.home: {error.what}; {error.why}; {error.next_step}"]
-    scene = empty_scene(rig)
-    near = ClearanceModel(rig, scene).self_clearance(rig.home)
-    required = scene.self_clearance + CLEARANCE_RESERVE
-    if near.distance >= required:
-        return []
-    gap, least = distinct_figures((near.distance * 1e3, required * 1e3), 2)
-    apart = f"is {gap} mm from" if near.distance > 0.0 else "touches"
-    return [
-        f"platform.home: {near.first} {apart} {near.second}; a motion that begins there needs"
-        f" {least} mm, by the default of a scene's clearance.self_mm; if two outlets or anchors are"
-        " interchanged, correct them; otherwise move them or the home position"
-    ]
+    return unusable_home(rig)
 
 
 # Kernel CAN bus: each check with the command that fixes it.

@@ -10,14 +10,14 @@ from model.clearance import PLATFORM, ClearanceModel, Nearest, SelfModel, cable_
 from model.distances import convex_bodies, separation
 from model.errors import BadInput, distinct_figures
 from model.files.new_rig import CABLES_MOST
-from model.kinematics import axis_distances, structure_matrix
+from model.kinematics import NoCable, axis_distances, structure_matrix
 from model.pose import Pose
 from model.rig import Rig
-from model.scene import Leg, Scene, legs_of
+from model.scene import Leg, Scene, empty_scene, legs_of
 from model.shapes import Sphere
 from model.statics.feasibility import limiting_cables
-from model.statics.gravity import inertial_wrench
-from model.statics.tension_distribution import remedy
+from model.statics.gravity import inertial_wrench, working_tensions
+from model.statics.tension_distribution import TensionInfeasible, remedy
 from model.statics.wrench_sets import rms_anchor_radius
 from planner.check import GENTLER, NEAR_AXIS, least_axis_distance
 from planner.check_report import CheckReport
@@ -29,6 +29,30 @@ SAME_ROTATION = 1e-7
 """Angle up to which two orientations are the same, [rad]: files round quaternions to nine digits.
 The path keeps the start's, and its check allows ten times this."""
 _NEAR_AXIS_WHY = "nearer than four pulley radii the motion of the cable's exit cannot be bounded"
+
+
+def unusable_home(rig: Rig) -> list[str]:
+    """Why no motion can begin at home, as remarks; empty if one can.
+
+    The cables cannot hold the platform there, or are nearer to each other or to it than a scene
+    allows by default.
+    """
+    try:
+        working_tensions(rig, rig.home)
+    except (NoCable, TensionInfeasible) as error:
+        return [f"platform.home: {error.what}; {error.why}; {error.next_step}"]
+    scene = empty_scene(rig)
+    near = ClearanceModel(rig, scene).self_clearance(rig.home)
+    required = scene.self_clearance + CLEARANCE_RESERVE
+    if near.distance >= required:
+        return []
+    gap, least = distinct_figures((near.distance * 1e3, required * 1e3), 2)
+    apart = f"is {gap} mm from" if near.distance > 0.0 else "touches"
+    return [
+        f"platform.home: {near.first} {apart} {near.second}; a motion that begins there needs"
+        f" {least} mm, by the default of a scene's clearance.self_mm; if two outlets or anchors are"
+        " interchanged, correct them; otherwise move them or the home position"
+    ]
 
 
 def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) -> None:

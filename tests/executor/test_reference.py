@@ -639,9 +639,7 @@ def test_drives_that_a_motion_found_without_torque_and_did_not_enable_never_held
     interlock.found_released((), ALL)
     interlock.begin(Path("home"), interlock.still_counts([0] * 8), rehome=rehome)
     assert interlock.why_released((), ALL), "expected to hold, even if this program is killed"
-    interlock.end(
-        State.LATCHED, "STO", Path("home"), holding=True, positions=[0] * 8, released=ALL
-    )
+    interlock.end(State.LATCHED, "STO", Path("home"), holding=True, positions=[0] * 8, released=ALL)
     MotionInterlock(rig).found_released((), ALL)
     assert interlock.why_unreferenced() == ""
 

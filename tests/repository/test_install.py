@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -17,13 +18,18 @@ case "$*" in
   "-m venv "*)
     mkdir -p "$3/bin" && cd "$3/bin" || exit 1
     echo "#!/bin/sh" > cdpr
-    [ -e python ] || cp "{path}" python
+    [ -e python ] || cp "{path}" python || exit 1
     chmod +x cdpr ;;
-  "-m pip "*) [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
+  "-m pip check "* | "-m pip install --no-user "*)
+    [ ! -e killed ] || kill $PPID
+    [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
+  "-m pip "*) exit 1 ;;
 esac
 """
-"""Stands for a distribution's Python: with venv, which keeps a Python that exists; pip only in an
-environment, where it fails while a file `broken` exists."""
+"""Stands for a distribution's Python: with venv, which keeps a Python that exists and fails at a
+dangling link; pip only in an environment, where it fails while a file `broken` exists, ends
+`make`'s shell while `killed` does, and refuses to install into the user's folder, as `pip.conf` may
+say."""
 
 
 @pytest.fixture
@@ -41,9 +47,12 @@ def python(folder: Path, version: str) -> Path:
     return path
 
 
-def make(target: str, python: Path) -> bool:
-    command = ["make", f"PYTHON={python}", target]
-    return subprocess.run(command, cwd=python.parent, capture_output=True).returncode == 0
+def make(target: str, python: Path, folder: Path | None = None) -> bool:
+    """Whether it succeeds, from the Python's folder or another; the shell's PWD is that name."""
+    folder = folder or python.parent
+    command, settings = ["make", f"PYTHON={python}", target], {**os.environ, "PWD": str(folder)}
+    done = subprocess.run(command, cwd=folder, env=settings, capture_output=True)
+    return done.returncode == 0
 
 
 def installed(folder: Path) -> tuple[str, str]:
@@ -56,6 +65,57 @@ def test_an_installation_on_another_python_is_replaced(folder: Path) -> None:
     """`venv` itself keeps the Python of an environment that exists."""
     assert make("install", python(folder, "3.11.2"))
     assert make("install", python(folder, "3.12.1"))
+    assert installed(folder) == ("3.12.1", "3.12.1")
+
+
+def test_a_folder_reached_by_another_name_is_the_same_folder(folder: Path) -> None:
+    interpreter, link = python(folder, "3.12.1"), folder / "link"
+    link.symlink_to(folder)
+    assert make("install", interpreter)
+    own = folder / ".venv/own"
+    own.touch()
+    (folder / "broken").touch()
+    assert make("install", interpreter, link)
+    assert own.exists()
+
+
+@pytest.mark.parametrize("reason", ["broken", "killed"])
+def test_an_installation_is_replaced_only_by_a_complete_one(folder: Path, reason: str) -> None:
+    """Without a network it would be lost. It comes back to the path that its scripts hold."""
+    old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
+    assert make("install", old)
+    own, obstacle = folder / ".venv/own", folder / reason
+    own.touch()
+    obstacle.touch()
+    assert not make("install", new)
+    assert own.exists()
+    assert installed(folder) == ("3.11.2", "3.11.2")
+    obstacle.unlink()
+    assert make("install", new)
+    assert installed(folder) == ("3.12.1", "3.12.1")
+    assert not own.exists()
+    assert not list(folder.glob(".venv-*"))
+
+
+def test_an_installation_outlives_a_replacement_that_lost_power(folder: Path) -> None:
+    old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
+    assert make("install", old)
+    (folder / ".venv").rename(folder / ".venv-replaced")
+    subprocess.run([new, "-m", "venv", ".venv"], cwd=folder, check=True)
+    (folder / ".venv/installed").write_text(f"Python 3.12.1 in {folder}, unfinished")
+    (folder / "broken").touch()
+    assert not make("install", new)
+    assert installed(folder) == ("3.11.2", "3.11.2")
+
+
+def test_an_installation_whose_python_moved_is_made_again(folder: Path) -> None:
+    """The same version is elsewhere, as of conda, pyenv or uv; venv keeps the dangling link."""
+    interpreter = python(folder, "3.12.1")
+    assert make("install", interpreter)
+    link = folder / ".venv/bin/python"
+    link.unlink()
+    link.symlink_to(folder / "gone/python3.12")
+    assert make("install", interpreter)
     assert installed(folder) == ("3.12.1", "3.12.1")
 
 
