@@ -5,6 +5,7 @@ SHELL := /bin/sh
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+REPLACED := $(VENV)-replaced
 PIP := install --quiet --disable-pip-version-check
 QUICK := -q -n 2 -m "not slow" --ignore tests/repository
 PACKAGES := cdpr calibration executor simulation planner drivers tracking model
@@ -29,9 +30,10 @@ help:  ## Show this help
 	@echo "The Python to build on: make PYTHON=python3.12 ... (3.11 or newer; now: $(PYTHON))"
 
 # Nothing is installed while the stamp agrees with the pins, the Python and the folder (console scripts hold its
-# absolute path), so everything works without a network after the first time.
+# absolute path), so everything works without a network after the first time. An installation that does not agree with
+# Python or folder is kept aside until the new one is complete, and put back, where its scripts expect it, if it fails.
 install:  ## Create .venv and install everything into it, pinned (once)
-	@place="$$("$(PYTHON)" -V 2>&1) in $$PWD"; \
+	@place="$$("$(PYTHON)" -V 2>&1) in $$(pwd -P)"; \
 	pins="$$(cat pyproject.toml constraints.txt | cksum)"; \
 	stamp="$$(cat "$(STAMP)" 2>/dev/null)"; \
 	if [ "$$stamp" = "$$place, $$pins" ] && [ -x "$(BIN)/python" ]; then exit 0; fi; \
@@ -46,7 +48,15 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	  "") if [ -e "$(VENV)" ] && [ "$$("$(BIN)/python" -V 2>&1)" != "$$("$(PYTHON)" -V 2>&1)" ]; then \
 	    echo "$(VENV) is not one of these installations, and not of this Python. Next: remove it, or name another:" \
 	      "make VENV=.venv-cdpr $(MAKECMDGOALS)" >&2; exit 1; fi ;; \
-	  *) rm -rf "$(VENV)" ;; esac; \
+	  *) if [ -e "$(REPLACED)/installed" ]; then rm -rf "$(VENV)"; \
+	    else rm -rf "$(REPLACED)" && mv "$(VENV)" "$(REPLACED)"; fi || exit 1 ;; esac; \
+	put_back() { \
+	  if [ -e "$(REPLACED)/installed" ]; then \
+	    rm -rf "$(VENV)" && mv "$(REPLACED)" "$(VENV)" && \
+	    echo "The installation failed; the previous one is in $(VENV) again. Next: repeat it with a network; until" \
+	      "then, use the previous one: . $(BIN)/activate" >&2; fi; }; \
+	trap put_back EXIT; \
+	trap 'exit 1' HUP INT TERM; \
 	"$(PYTHON)" -m venv "$(VENV)" && \
 	echo "$$place, unfinished" > "$(STAMP)" && \
 	"$(BIN)/python" -m pip $(PIP) --only-binary :all: -c constraints.txt hatchling && \
@@ -56,7 +66,8 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	{ "$(BIN)/python" -c '$(COMPILE_REST)' & rest=$$!; } && \
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
 	wait $$rest && \
-	echo "$$place, $$pins" > "$(STAMP)"
+	echo "$$place, $$pins" > "$(STAMP)" && \
+	trap - EXIT && rm -rf "$(REPLACED)"
 
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
 	"$(BIN)/cdpr" demo
@@ -155,4 +166,4 @@ clean:  ## Remove build output and caches (never .venv or your runs)
 	find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 distclean: clean  ## Remove .venv too
-	rm -rf "$(VENV)" .venv-lowest .venv-python
+	rm -rf "$(VENV)" "$(REPLACED)" .venv-lowest .venv-python

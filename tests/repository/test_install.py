@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 from pathlib import Path
@@ -19,11 +20,14 @@ case "$*" in
     echo "#!/bin/sh" > cdpr
     [ -e python ] || cp "{path}" python
     chmod +x cdpr ;;
-  "-m pip "*) [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
+  "-m pip "*)
+    [ ! -e killed ] || kill $PPID
+    [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
 esac
 """
 """Stands for a distribution's Python: with venv, which keeps a Python that exists; pip only in an
-environment, where it fails while a file `broken` exists."""
+environment, where it fails while a file `broken` exists, and ends `make`'s shell while `killed`
+does."""
 
 
 @pytest.fixture
@@ -41,9 +45,12 @@ def python(folder: Path, version: str) -> Path:
     return path
 
 
-def make(target: str, python: Path) -> bool:
-    command = ["make", f"PYTHON={python}", target]
-    return subprocess.run(command, cwd=python.parent, capture_output=True).returncode == 0
+def make(target: str, python: Path, folder: Path | None = None) -> bool:
+    """Whether it succeeds, from the Python's folder or another; the shell's PWD is that name."""
+    folder = folder or python.parent
+    command, settings = ["make", f"PYTHON={python}", target], {**os.environ, "PWD": str(folder)}
+    done = subprocess.run(command, cwd=folder, env=settings, capture_output=True)
+    return done.returncode == 0
 
 
 def installed(folder: Path) -> tuple[str, str]:
@@ -57,6 +64,60 @@ def test_an_installation_on_another_python_is_replaced(folder: Path) -> None:
     assert make("install", python(folder, "3.11.2"))
     assert make("install", python(folder, "3.12.1"))
     assert installed(folder) == ("3.12.1", "3.12.1")
+
+
+def test_a_folder_reached_by_another_name_is_the_same_folder(folder: Path) -> None:
+    interpreter, link = python(folder, "3.12.1"), folder / "link"
+    link.symlink_to(folder)
+    assert make("install", interpreter)
+    own = folder / ".venv/own"
+    own.touch()
+    (folder / "broken").touch()
+    assert make("install", interpreter, link)
+    assert own.exists()
+
+
+@pytest.mark.parametrize("reason", ["broken", "killed"])
+def test_an_installation_is_replaced_only_by_a_complete_one(folder: Path, reason: str) -> None:
+    """Without a network it would be lost. It comes back to the path that its scripts hold."""
+    old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
+    assert make("install", old)
+    own, obstacle = folder / ".venv/own", folder / reason
+    own.touch()
+    obstacle.touch()
+    assert not make("install", new)
+    assert own.exists()
+    assert installed(folder) == ("3.11.2", "3.11.2")
+    obstacle.unlink()
+    assert make("install", new)
+    assert installed(folder) == ("3.12.1", "3.12.1")
+    assert not own.exists()
+    assert not list(folder.glob(".venv-*"))
+
+
+def test_an_installation_behind_a_link_is_left_as_it_is(folder: Path) -> None:
+    """As of another working tree of the repository."""
+    interpreter, tree = python(folder, "3.12.1"), folder / "tree"
+    assert make("install", interpreter)
+    stamp = (folder / ".venv/installed").read_text()
+    tree.mkdir()
+    for file in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(folder / file, tree)
+    (tree / ".venv").symlink_to(folder / ".venv")
+    assert make("install", interpreter, tree)
+    assert (folder / ".venv/installed").read_text() == stamp
+    assert not (tree / ".venv").is_symlink()
+
+
+def test_an_installation_outlives_a_replacement_that_lost_power(folder: Path) -> None:
+    old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
+    assert make("install", old)
+    (folder / ".venv").rename(folder / ".venv-replaced")
+    subprocess.run([new, "-m", "venv", ".venv"], cwd=folder, check=True)
+    (folder / ".venv/installed").write_text(f"Python 3.12.1 in {folder}, unfinished")
+    (folder / "broken").touch()
+    assert not make("install", new)
+    assert installed(folder) == ("3.11.2", "3.11.2")
 
 
 def test_an_environment_of_the_user_s_own_is_kept(folder: Path) -> None:
