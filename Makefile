@@ -30,8 +30,8 @@ help:  ## Show this help
 	@echo "The Python to build on: make PYTHON=python3.12 ... (3.11 or newer; now: $(PYTHON))"
 
 # Nothing is installed while the stamp agrees with the pins, the Python and the folder (console scripts hold its
-# absolute path), so everything works without a network after the first time. An installation that does not agree with
-# Python or folder is kept aside until the new one is complete, and put back, where its scripts expect it, if it fails.
+# absolute path), so everything works without a network after the first time. An installation for another Python or
+# folder, or whose Python is gone, is kept aside until the new one is complete, and put back where that one fails.
 install:  ## Create .venv and install everything into it, pinned (once)
 	@place="$$("$(PYTHON)" -V 2>&1) in $$(pwd -P)"; \
 	pins="$$(cat pyproject.toml constraints.txt | cksum)"; \
@@ -43,18 +43,18 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) has no venv module. Next, on Debian or Ubuntu: sudo apt-get install python3-venv" >&2; exit 1; }; \
 	echo "Installing into $(VENV) (once; needs the network) ..."; \
-	case "$$stamp" in \
-	  "$$place, "*) ;; \
-	  "") if [ -e "$(VENV)" ] && [ "$$("$(BIN)/python" -V 2>&1)" != "$$("$(PYTHON)" -V 2>&1)" ]; then \
+	if [ -z "$$stamp" ]; then \
+	  if [ -e "$(VENV)" ] && [ "$$("$(BIN)/python" -V 2>&1)" != "$$("$(PYTHON)" -V 2>&1)" ]; then \
 	    echo "$(VENV) is not one of these installations, and not of this Python. Next: remove it, or name another:" \
-	      "make VENV=.venv-cdpr $(MAKECMDGOALS)" >&2; exit 1; fi ;; \
-	  *) if [ -e "$(REPLACED)/installed" ]; then rm -rf "$(VENV)"; \
-	    else rm -rf "$(REPLACED)" && mv "$(VENV)" "$(REPLACED)"; fi || exit 1 ;; esac; \
+	      "make VENV=.venv-cdpr $(MAKECMDGOALS)" >&2; exit 1; fi; \
+	elif [ "$${stamp%, *}" != "$$place" ] || [ ! -x "$(BIN)/python" ]; then \
+	  if [ -e "$(REPLACED)/installed" ]; then rm -rf "$(VENV)"; \
+	  else rm -rf "$(REPLACED)" && mv "$(VENV)" "$(REPLACED)"; fi || exit 1; fi; \
 	put_back() { \
 	  if [ -e "$(REPLACED)/installed" ]; then \
 	    rm -rf "$(VENV)" && mv "$(REPLACED)" "$(VENV)" && \
-	    echo "The installation failed; the previous one is in $(VENV) again. Next: repeat it with a network; until" \
-	      "then, use the previous one: . $(BIN)/activate" >&2; fi; }; \
+	    echo "The installation failed; the previous one is in $(VENV) again. Next: repeat it with a network;" \
+	      "without one, try the previous one: . $(BIN)/activate" >&2; fi; }; \
 	trap put_back EXIT; \
 	trap 'exit 1' HUP INT TERM; \
 	"$(PYTHON)" -m venv "$(VENV)" && \

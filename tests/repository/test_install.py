@@ -18,16 +18,16 @@ case "$*" in
   "-m venv "*)
     mkdir -p "$3/bin" && cd "$3/bin" || exit 1
     echo "#!/bin/sh" > cdpr
-    [ -e python ] || cp "{path}" python
+    [ -e python ] || cp "{path}" python || exit 1
     chmod +x cdpr ;;
   "-m pip "*)
     [ ! -e killed ] || kill $PPID
     [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
 esac
 """
-"""Stands for a distribution's Python: with venv, which keeps a Python that exists; pip only in an
-environment, where it fails while a file `broken` exists, and ends `make`'s shell while `killed`
-does."""
+"""Stands for a distribution's Python: with venv, which keeps a Python that exists and fails at a
+dangling link; pip only in an environment, where it fails while a file `broken` exists, and ends
+`make`'s shell while `killed` does."""
 
 
 @pytest.fixture
@@ -118,6 +118,17 @@ def test_an_installation_outlives_a_replacement_that_lost_power(folder: Path) ->
     (folder / "broken").touch()
     assert not make("install", new)
     assert installed(folder) == ("3.11.2", "3.11.2")
+
+
+def test_an_installation_whose_python_moved_is_made_again(folder: Path) -> None:
+    """The same version is elsewhere, as of conda, pyenv or uv; venv keeps the dangling link."""
+    interpreter = python(folder, "3.12.1")
+    assert make("install", interpreter)
+    link = folder / ".venv/bin/python"
+    link.unlink()
+    link.symlink_to(folder / "gone/python3.12")
+    assert make("install", interpreter)
+    assert installed(folder) == ("3.12.1", "3.12.1")
 
 
 def test_an_environment_of_the_user_s_own_is_kept(folder: Path) -> None:
