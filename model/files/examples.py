@@ -66,29 +66,32 @@ def ready_folder(name: str = "configs") -> Path:
 def find_examples(configs: Path, sessions: Path) -> list[Example]:
     """All examples: rigs, then scenes, then sessions, each by name.
 
+    Files of the user's own that name no schema, and an editor's hidden ones, are left out.
+
     Args:
         configs: The folder of the example rigs and scenes.
         sessions: The folder of the recorded sessions.
     """
-    files = [_ready_file(path) for path in configs.glob("*.yaml")]
+    files = [each for path in configs.glob("[!.]*.yaml") if (each := _ready_file(path))]
     folders = [_session(path) for path in sessions.iterdir() if (path / _ABOUT).is_file()]
     order = ("rig", "scene", "session")
     return sorted([*files, *folders], key=lambda example: (order.index(example.kind), example.name))
 
 
-def _ready_file(path: Path) -> Example:
+def _ready_file(path: Path) -> Example | None:
+    """The rig or scene; None where the first line names no schema."""
     text = read_text(path)
-    lines = text.splitlines()
-    kind = _SCHEMA.search(lines[0])
+    first, second, *_ = [*text.splitlines(), "", ""]
+    kind = _SCHEMA.search(first)
     if kind is None:
-        raise BadInput(f"{path.name} names no schema in its first line", where=str(path))
+        return None
     described = _DESCRIPTION.search(text)
-    about = described.group(1) if described else lines[1].removeprefix("# ")
+    about = described.group(1) if described else second.removeprefix("# ")
     return Example(path.stem, kind.group(1), about, path, "configs")
 
 
 def _session(path: Path) -> Example:
-    title = read_text(path / _ABOUT).splitlines()[0].removeprefix("# ")
+    title = read_text(path / _ABOUT).partition("\n")[0].removeprefix("# ")
     return Example(path.name, "session", title, path, "examples")
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from model.files.examples import find_examples
 from tests.cli.plans import CONFIGS
 from tests.cli.program import call, nothing_written, one_message
 
@@ -21,6 +22,19 @@ def test_every_ready_file_and_session_is_listed_with_what_it_is() -> None:
     assert listed["environment_1"][0] == "scene"
     assert listed["rig_session"][0] == "session"
     assert all(len(words) > 4 for words in listed.values())
+
+
+def test_files_of_the_user_s_own_do_not_break_the_list(tmp_path: Path) -> None:
+    """A newcomer saves a rig where the documented commands find rigs, or has one open in Emacs."""
+    (tmp_path / "rig.yaml").write_text((CONFIGS / "gachon_8_6.yaml").read_text())
+    (tmp_path / "marked.yaml").write_text("# yaml-language-server: $schema=a/scene.schema.json")
+    (tmp_path / "empty.yaml").touch()
+    (tmp_path / "unmarked.yaml").write_text("schema_version: 1\nname: mine\n")
+    (tmp_path / ".#rig.yaml").symlink_to("anna@lab.1234")
+    (tmp_path / "session").mkdir()
+    (tmp_path / "session/README.md").touch()
+    found = [(each.kind, each.name) for each in find_examples(tmp_path, tmp_path)]
+    assert found == [("rig", "rig"), ("scene", "marked"), ("session", "session")]
 
 
 def test_copies_are_the_files_but_for_the_address_of_the_schema(tmp_path: Path) -> None:
