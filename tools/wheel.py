@@ -65,8 +65,9 @@ def install(wheel: Path, folder: Path, with_index: bool) -> Path:
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
     borrowed = [] if with_index else ["--no-deps", "--no-index"]
-    pip = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    run([*pip, *borrowed, "-c", str(ROOT / "constraints.txt"), str(wheel)], folder)
+    options = ["--no-user", "--quiet", "--disable-pip-version-check", *borrowed]
+    pinned = ["-c", str(ROOT / "constraints.txt"), str(wheel)]
+    run([str(python), "-m", "pip", "install", *options, *pinned], folder)
     if not with_index:
         (site,) = folder.glob("lib/python*/site-packages")
         (site / "borrowed.pth").write_text(sysconfig.get_path("purelib") + "\n")

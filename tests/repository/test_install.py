@@ -20,14 +20,16 @@ case "$*" in
     echo "#!/bin/sh" > cdpr
     [ -e python ] || cp "{path}" python || exit 1
     chmod +x cdpr ;;
-  "-m pip "*)
+  "-m pip check "* | "-m pip install --no-user "*)
     [ ! -e killed ] || kill $PPID
     [ -e "${{0%python}}cdpr" ] && [ ! -e broken ] ;;
+  "-m pip "*) exit 1 ;;
 esac
 """
 """Stands for a distribution's Python: with venv, which keeps a Python that exists and fails at a
-dangling link; pip only in an environment, where it fails while a file `broken` exists, and ends
-`make`'s shell while `killed` does."""
+dangling link; pip only in an environment, where it fails while a file `broken` exists, ends
+`make`'s shell while `killed` does, and refuses to install into the user's folder, as `pip.conf` may
+say."""
 
 
 @pytest.fixture
