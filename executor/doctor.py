@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import platform
 import pwd
+import re
 import resource
 import socket
 import sys
@@ -15,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import distributions, version
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
@@ -59,11 +60,7 @@ LIBRARIES = {
     "matplotlib": "matplotlib",
 }
 """Distributions that ours requires, by the module that each installs."""
-
-
 LIMITS = Path("/etc/security/limits.d/cdpr.conf")
-
-
 #: States of a controller in which it takes full part in the traffic.
 HEALTHY = ("ERROR-ACTIVE", "ERROR-WARNING")
 
@@ -122,16 +119,24 @@ def own_packages() -> list[MachineCheck]:
 
 
 def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
-    """Whether every library can be imported, and its version.
+    """Whether every library can be imported, and is as new as required.
 
     Args:
         packages: Distributions by module, as `LIBRARIES`.
     """
+    lines = [line for ours in distributions(name="cdpr") for line in ours.requires or []]
+    lowest: dict[str, str] = dict(re.findall(r"(?m)^([\w.-]+)>=([\d.]+)", "\n".join(lines)))
     checks = []
     for module, package in packages.items():
         try:
-            import_module(module)
-            checks.append(MachineCheck(package, True, version(package)))
+            own, found = getattr(import_module(module), "__version__", ""), version(package)
+            if module == "cv2" and not found.startswith(own):
+                found = own  # another distribution of OpenCV replaced the files of this one
+            bound = lowest.get(package, "0")
+            has, needs = ([int(n) for n in re.findall(r"\d+", text)] for text in (found, bound))
+            text = found if has >= needs else f"{found}; {bound} or newer is required"
+            fix = f"pip install --force-reinstall --no-deps '{package}>={bound}'"
+            checks.append(MachineCheck(package, has >= needs, text, fix))
         except Exception as error:  # any: the module's own code runs, and may be damaged
             absent = isinstance(error, ModuleNotFoundError)
             fix = f"pip install {'' if absent else '--force-reinstall '}{package}"

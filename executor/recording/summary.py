@@ -17,6 +17,7 @@ from importlib.metadata import PackageNotFoundError, version
 from itertools import pairwise
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,12 +30,13 @@ from model.pose import Array
 from model.rig import Rig
 from model.statics.wrench_sets import rms_anchor_radius
 
+OPENCV = "opencv-python-headless"
 LIBRARIES = (
     "cdpr",
     "numpy",
     "python-can",
     "canopen",
-    "opencv-python-headless",
+    OPENCV,
     "python-fcl",
 )
 
@@ -47,6 +49,9 @@ def versions() -> dict[str, str]:
             found[name] = version(name)
         except PackageNotFoundError:
             found[name] = "not installed"
+    if not found[OPENCV].startswith(cv2.__version__):
+        # Another distribution of OpenCV, as other packages require, replaced the files of this one.
+        found[OPENCV] = cv2.__version__
     return found
 
 

@@ -41,6 +41,7 @@ from executor.doctor import (
 )
 from executor.interlock import locks
 from executor.interlock.locks import SetUpLock
+from executor.recording.summary import versions
 from model.rig import load_rig, rig_from_document
 from simulation.drives.eds_file import profile_path, read_eds
 from tests.cli.plans import RIG
@@ -347,6 +348,27 @@ def test_every_required_library_is_checked_under_the_module_that_it_installs() -
     installed = packages_distributions()
     for module, package in doctor.LIBRARIES.items():
         assert package in [name.lower() for name in installed[module]]
+
+
+def test_another_opencv_in_place_of_ours_is_recognised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`opencv-python`, as other packages require, overwrites the files and not the metadata."""
+    monkeypatch.setattr("cv2.__version__", "4.10.0")
+    (check,) = doctor.libraries({"cv2": "opencv-python-headless"})
+    assert (check.good, check.text) == (False, "4.10.0; 5.0.0.93 or newer is required")
+    assert check.fix.endswith("'opencv-python-headless>=5.0.0.93'")
+    assert "--force-reinstall" in check.fix, "pip takes the version in the metadata for installed"
+    assert versions()["opencv-python-headless"] == "4.10.0"
+
+
+def test_a_library_older_than_required_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As after the installation of another package that requires an old one."""
+    monkeypatch.setattr(doctor, "version", lambda _: "1.9.3")
+    (check,) = doctor.libraries({"scipy": "scipy"})
+    assert (check.good, check.text) == (False, "1.9.3; 1.16 or newer is required")
+    assert check.fix.endswith("'scipy>=1.16'")
+    monkeypatch.setattr(doctor, "version", lambda _: "1.16.0rc1")
+    (check,) = doctor.libraries({"scipy": "scipy"})
+    assert (check.good, check.text) == (True, "1.16.0rc1")
 
 
 @pytest.mark.parametrize(
