@@ -45,7 +45,11 @@ MARKER = re.compile(
     r"|with options)"
     r":\s*(?P<text>.*)"
 )
-CLONE = ("configs", "examples", ".venv")
+CLONE = {
+    "configs": ROOT / "configs",
+    "examples": ROOT / "examples",
+    ".venv": Path(sys.prefix),  # `make VENV=…` gives it another name
+}
 BLOCK_LIMIT_S = 600.0
 READY_LIMIT_S = 120.0
 ENDED_BY_CTRL_C = (0, 130)
@@ -158,9 +162,9 @@ class Terminal:
     def __init__(self, base: Path) -> None:
         self.folder = base / "cdpr"
         self.folder.mkdir()
-        for name in CLONE:
-            if (ROOT / name).exists():
-                (self.folder / name).symlink_to(ROOT / name)
+        for name, target in CLONE.items():
+            if target.exists():
+                (self.folder / name).symlink_to(target)
         settings = {"XDG_RUNTIME_DIR": "r", "XDG_STATE_HOME": "s", "TMPDIR": "t"}
         for name in settings.values():
             (base / name).mkdir(mode=0o700)

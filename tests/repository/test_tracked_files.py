@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import subprocess
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -70,6 +71,16 @@ def test_no_generated_output_is_tracked() -> None:
     found = [p for p in files() if p.suffix in suffixes or "__pycache__" in p.parts]
     found = [path for path in found if path not in written]
     assert not found
+
+
+@pytest.mark.parametrize("file", [".gitignore", ".dockerignore"])
+def test_every_environment_that_make_creates_or_advises_is_ignored(file: str) -> None:
+    """`make lint` checks what git does not ignore, and `docker build` copies it."""
+    ignored = [line.rstrip("/") for line in (ROOT / file).read_text().splitlines()]
+    makefile = (ROOT / "Makefile").read_text().replace("$(VENV)", ".venv")
+    names = set(re.findall(r"\.venv[\w-]*", makefile))
+    assert {".venv", ".venv-cdpr"} <= names
+    assert not [name for name in names if not any(fnmatch(name, each) for each in ignored)]
 
 
 def test_documented_commands_do_not_write_into_the_repository() -> None:
