@@ -43,6 +43,10 @@ class Failed(Exception):
     """A requirement of a release is not met."""
 
 
+class NoRepository(Exception):
+    """Git is missing or refuses, or this folder has no commit or is part of another repository."""
+
+
 def build() -> Path:
     """Builds the wheel in dist/."""
     require_tag_of_this_version()
@@ -54,10 +58,27 @@ def build() -> Path:
 
 def require_tag_of_this_version() -> None:
     """Checks that a version tag of this commit matches the version."""
-    command = ["git", "tag", "--points-at", "HEAD", "--list", "v*"]
-    shown = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if wrong := [tag for tag in shown.stdout.split() if tag != f"v{VERSION}"]:
+    try:
+        tags = git("tag", "--points-at", "HEAD", "--list", "v*").split()
+    except NoRepository:
+        return
+    if wrong := [tag for tag in tags if tag != f"v{VERSION}"]:
         raise Failed(f"this commit has the tag {wrong[0]}, pyproject.toml has version {VERSION}")
+
+
+def git(*words: str) -> str:
+    """Output of a git command on this repository.
+
+    Raises:
+        NoRepository: This is a release that was unpacked, perhaps into another repository.
+    """
+    try:
+        inside = run(["git", "rev-parse", "--show-prefix", "HEAD"], ROOT).splitlines()[0]
+    except (Failed, FileNotFoundError) as error:
+        raise NoRepository(str(error)) from None
+    if inside:
+        raise NoRepository(f"it is the folder {inside} of another repository")
+    return run(["git", *words], ROOT)
 
 
 def install(wheel: Path, folder: Path, with_index: bool) -> Path:

@@ -18,6 +18,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from tests.cli.program import call
+from tools.wheel import Failed, NoRepository, git, require_tag_of_this_version
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -120,6 +121,38 @@ def test_the_citation_names_the_software_and_the_paper() -> None:
     assert citation["license"] == PROJECT["project"]["license"]
     (paper,) = citation["references"]
     assert [author["family-names"] for author in paper["authors"]] == ["Xu", "Park"]
+
+
+def repository(folder: Path) -> Path:
+    """A git repository with one commit, which has the tag of another version."""
+    settings = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
+    for words in (["init"], ["commit", "--allow-empty", "-m", "first"], ["tag", "v99.0"]):
+        command = ["git", "-C", folder, *settings, *words]
+        subprocess.run(command, check=True, capture_output=True)
+    return folder
+
+
+def test_a_tag_of_another_version_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tools.wheel.ROOT", repository(tmp_path))
+    with pytest.raises(Failed, match=r"has the tag v99\.0"):
+        require_tag_of_this_version()
+
+
+@pytest.mark.parametrize("program", ["git", "none"])
+def test_a_release_unpacked_in_another_repository_is_not_judged_by_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, program: str
+) -> None:
+    """A laboratory's own, or with the sources of all that it uses; or there is no git at all."""
+    inside = repository(tmp_path) / "cdpr"
+    inside.mkdir()
+    monkeypatch.setattr("tools.wheel.ROOT", inside)
+    if program == "none":
+        monkeypatch.setenv("PATH", str(inside))
+    require_tag_of_this_version()
+    with pytest.raises(NoRepository):
+        git("ls-files")
 
 
 @pytest.mark.slow

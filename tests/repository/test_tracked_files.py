@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import subprocess
 from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
 
 from executor.doctor import PACKAGES
+from tools.wheel import NoRepository, git
 
 ROOT = Path(__file__).parents[2]
 
@@ -24,11 +24,11 @@ NAMES = {"utils", "util", "common", "helpers", "core", "misc"}
 
 def files() -> list[Path]:
     """The tracked files of the repository: others may be a user's own."""
-    command = ["git", "ls-files", "-z"]
-    listing = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if listing.returncode != 0:
-        pytest.skip(f"not a git work tree: {listing.stderr.strip()}")
-    found = (ROOT / name for name in listing.stdout.split("\0") if name)
+    try:
+        listing = git("ls-files", "-z")
+    except NoRepository as reason:
+        pytest.skip(f"not a git work tree: {reason}")
+    found = (ROOT / name for name in listing.split("\0") if name)
     return [path for path in found if path.is_file() and path != Path(__file__)]
 
 
