@@ -164,7 +164,7 @@ schema: install  ## Write the JSON schemas of the rig, scene and plan files into
 
 clean:  ## Remove build output and caches (never .venv or your runs)
 	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
-	find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find $(PACKAGES) tests benchmarks tools examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
-distclean: clean  ## Remove .venv too
+distclean: clean  ## Remove .venv too (never your runs)
 	rm -rf "$(VENV)" "$(REPLACED)" .venv-lowest .venv-python

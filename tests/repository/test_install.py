@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from executor.doctor import PACKAGES
+
 ROOT = Path(__file__).parents[2]
 
 PYTHON = """\
@@ -176,6 +178,14 @@ def test_pins_that_return_after_an_interrupted_installation_are_installed_again(
 
 def test_wheels_are_checked_where_the_python_has_no_pip(folder: Path) -> None:
     assert make("check-arm64", python(folder, "3.12.1"))
+
+
+def test_clean_removes_byte_code_from_every_folder(folder: Path) -> None:
+    tops = (*PACKAGES, "tests", "benchmarks", "tools", "examples")
+    for name in tops:
+        (folder / name / "part/__pycache__").mkdir(parents=True)
+    assert make("clean", python(folder, "3.12.1"))
+    assert not list(folder.rglob("__pycache__"))
 
 
 @pytest.mark.root
