@@ -38,6 +38,9 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	pins="$$(cat pyproject.toml constraints.txt | cksum)"; \
 	stamp="$$(cat "$(STAMP)" 2>/dev/null)"; \
 	if [ "$$stamp" = "$$place, $$pins" ] && [ -x "$(BIN)/python" ]; then exit 0; fi; \
+	case "$$(pwd -P)" in *[\"\`\$$]*) \
+	  echo 'The installed programs do not work in a folder whose path contains $$, ` or ".' >&2; \
+	  echo "Next: rename the folder; spaces and umlauts are fine" >&2; exit 1 ;; esac; \
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "cdpr needs Python 3.11 or newer; $(PYTHON) is $$("$(PYTHON)" -V 2>/dev/null || echo 'not there')." >&2; \
 	  echo "Next: install one and name it, for example: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }; \

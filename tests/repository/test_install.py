@@ -135,6 +135,22 @@ def test_an_installation_whose_python_moved_is_made_again(folder: Path) -> None:
     assert installed(folder) == ("3.12.1", "3.12.1")
 
 
+@pytest.mark.parametrize(
+    ("name", "good"),
+    [("ein Ordner für cdpr", True), ("a $b", False), ("a `b", False), ('a "b', False)],
+)
+def test_a_folder_whose_name_a_shell_would_expand_is_refused(
+    folder: Path, name: str, good: bool
+) -> None:
+    """pip begins a program's file with a line of shell that has the path in double quotes."""
+    inside = folder / name
+    inside.mkdir()
+    for file in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(folder / file, inside)
+    assert make("install", python(folder, "3.12.1"), inside) == good
+    assert (inside / ".venv").exists() == good
+
+
 def test_an_environment_of_the_user_s_own_is_kept(folder: Path) -> None:
     """An editor may have made it; on the same Python it is installed into."""
     old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
