@@ -38,6 +38,9 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	pins="$$(cat pyproject.toml constraints.txt | cksum)"; \
 	stamp="$$(cat "$(STAMP)" 2>/dev/null)"; \
 	if [ "$$stamp" = "$$place, $$pins" ] && [ -x "$(BIN)/python" ]; then exit 0; fi; \
+	case "$$(pwd -P)" in *[\"\`\$$]*) \
+	  echo 'The installed programs do not work in a folder whose path contains $$, ` or ".' >&2; \
+	  echo "Next: rename the folder; spaces and umlauts are fine" >&2; exit 1 ;; esac; \
 	"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "cdpr needs Python 3.11 or newer; $(PYTHON) is $$("$(PYTHON)" -V 2>/dev/null || echo 'not there')." >&2; \
 	  echo "Next: install one and name it, for example: make PYTHON=python3.12 $(MAKECMDGOALS)" >&2; exit 1; }; \
@@ -68,7 +71,7 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	"$(BIN)/cdpr" plan configs/gachon_8_6.yaml configs/environment_1.yaml -o "$(VENV)/first-plan.json" --force --json >/dev/null && \
 	wait $$rest && \
 	echo "$$place, $$pins" > "$(STAMP)" && \
-	rm -rf "$(REPLACED)/installed" "$(REPLACED)"
+	trap - EXIT && rm -rf "$(REPLACED)"
 
 demo: install  ## Plan, prove, run and report the paper's first environment on simulated drives
 	"$(BIN)/cdpr" demo
@@ -164,7 +167,7 @@ schema: install  ## Write the JSON schemas of the rig, scene and plan files into
 
 clean:  ## Remove build output and caches (never .venv or your runs)
 	rm -rf build dist site .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
-	find $(PACKAGES) tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find $(PACKAGES) tests benchmarks tools examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
-distclean: clean  ## Remove .venv too
+distclean: clean  ## Remove .venv too (never your runs)
 	rm -rf "$(VENV)" "$(REPLACED)" .venv-lowest .venv-python

@@ -16,7 +16,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, requires, version
+from importlib.metadata import distributions, version
 from importlib.util import find_spec
 from math import isfinite
 from pathlib import Path
@@ -68,11 +68,7 @@ LIBRARIES = {
     "matplotlib": "matplotlib",
 }
 """Distributions that ours requires, by the module that each installs."""
-
-
 LIMITS = Path("/etc/security/limits.d/cdpr.conf")
-
-
 #: States of a controller in which it takes full part in the traffic.
 HEALTHY = ("ERROR-ACTIVE", "ERROR-WARNING")
 
@@ -141,9 +137,7 @@ def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
     Args:
         packages: Distributions by module, as `LIBRARIES`.
     """
-    lines: list[str] = []
-    with suppress(PackageNotFoundError):  # ours may be used without an installation
-        lines += requires("cdpr") or []
+    lines = [line for ours in distributions(name="cdpr") for line in ours.requires or []]
     lowest: dict[str, str] = dict(re.findall(r"(?m)^([\w.-]+)>=([\d.]+)", "\n".join(lines)))
     checks = []
     for module, package in packages.items():
@@ -151,19 +145,16 @@ def libraries(packages: Mapping[str, str] = LIBRARIES) -> list[MachineCheck]:
             own, found = getattr(import_module(module), "__version__", ""), version(package)
             if module == "cv2" and not found.startswith(own):
                 found = own  # another distribution of OpenCV replaced the files of this one
-            checks.append(_library(package, found, lowest.get(package, "0")))
+            bound = lowest.get(package, "0")
+            has, needs = ([int(n) for n in re.findall(r"\d+", text)] for text in (found, bound))
+            text = found if has >= needs else f"{found}; {bound} or newer is required"
+            fix = f"pip install --force-reinstall --no-deps '{package}>={bound}'"
+            checks.append(MachineCheck(package, has >= needs, text, fix))
         except Exception as error:  # any: the module's own code runs, and may be damaged
             absent = isinstance(error, ModuleNotFoundError)
             fix = f"pip install {'' if absent else '--force-reinstall '}{package}"
             checks.append(MachineCheck(package, False, str(error), fix))
     return checks
-
-
-def _library(package: str, found: str, lowest: str) -> MachineCheck:
-    release, bound = ([int(n) for n in re.findall(r"\d+", text)] for text in (found, lowest))
-    text = found if release >= bound else f"{found}; {lowest} or newer is required"
-    fix = f"pip install --force-reinstall --no-deps '{package}>={lowest}'"
-    return MachineCheck(package, release >= bound, text, fix)
 
 
 def machine() -> list[MachineCheck]:

@@ -23,7 +23,8 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-PACKAGES = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
+WHEEL = PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]
+PACKAGES = WHEEL["packages"]
 VERSION = PROJECT["project"]["version"]
 
 TRIED = (
@@ -50,6 +51,7 @@ class NoRepository(Exception):
 def build() -> Path:
     """Builds the wheel in dist/."""
     require_tag_of_this_version()
+    require_files_of_the_commit()
     output = ROOT / "dist"
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(output)]
     run(command, ROOT)
@@ -64,6 +66,26 @@ def require_tag_of_this_version() -> None:
         return
     if wrong := [tag for tag in tags if tag != f"v{VERSION}"]:
         raise Failed(f"this commit has the tag {wrong[0]}, pyproject.toml has version {VERSION}")
+
+
+def require_files_of_the_commit() -> None:
+    """Checks that a release is built from committed files; another wheel is only remarked on.
+
+    Hatchling packs new files, in the folders outside the packages even those that git ignores.
+    """
+    status = ("status", "--porcelain", "--untracked-files=all")
+    try:
+        tag = git("tag", "--points-at", "HEAD", "--list", f"v{VERSION}").strip()
+        outside = git(*status, "--ignored", "--", *WHEEL["force-include"])
+        changed = (outside + git(*status, "--", *PACKAGES)).splitlines()
+    except NoRepository:
+        return
+    names = [line[3:] for line in changed if "__pycache__" not in line]
+    text = f"the wheel differs from the commit in {', '.join(names)}"
+    if names and tag:
+        raise Failed(f"{text}. Next: commit or remove them, or build from a fresh clone of {tag}")
+    if names:
+        print(f"note   {text}")
 
 
 def git(*words: str) -> str:

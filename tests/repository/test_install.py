@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from executor.doctor import PACKAGES
+
 ROOT = Path(__file__).parents[2]
 
 PYTHON = """\
@@ -97,6 +99,20 @@ def test_an_installation_is_replaced_only_by_a_complete_one(folder: Path, reason
     assert not list(folder.glob(".venv-*"))
 
 
+def test_an_installation_behind_a_link_is_left_as_it_is(folder: Path) -> None:
+    """As of another working tree of the repository."""
+    interpreter, tree = python(folder, "3.12.1"), folder / "tree"
+    assert make("install", interpreter)
+    stamp = (folder / ".venv/installed").read_text()
+    tree.mkdir()
+    for file in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(folder / file, tree)
+    (tree / ".venv").symlink_to(folder / ".venv")
+    assert make("install", interpreter, tree)
+    assert (folder / ".venv/installed").read_text() == stamp
+    assert not (tree / ".venv").is_symlink()
+
+
 def test_an_installation_outlives_a_replacement_that_lost_power(folder: Path) -> None:
     old, new = python(folder, "3.11.2"), python(folder, "3.12.1")
     assert make("install", old)
@@ -117,6 +133,22 @@ def test_an_installation_whose_python_moved_is_made_again(folder: Path) -> None:
     link.symlink_to(folder / "gone/python3.12")
     assert make("install", interpreter)
     assert installed(folder) == ("3.12.1", "3.12.1")
+
+
+@pytest.mark.parametrize(
+    ("name", "good"),
+    [("ein Ordner für cdpr", True), ("a $b", False), ("a `b", False), ('a "b', False)],
+)
+def test_a_folder_whose_name_a_shell_would_expand_is_refused(
+    folder: Path, name: str, good: bool
+) -> None:
+    """pip begins a program's file with a line of shell that has the path in double quotes."""
+    inside = folder / name
+    inside.mkdir()
+    for file in ("Makefile", "pyproject.toml", "constraints.txt"):
+        shutil.copy(folder / file, inside)
+    assert make("install", python(folder, "3.12.1"), inside) == good
+    assert (inside / ".venv").exists() == good
 
 
 def test_an_environment_of_the_user_s_own_is_kept(folder: Path) -> None:
@@ -162,6 +194,14 @@ def test_pins_that_return_after_an_interrupted_installation_are_installed_again(
 
 def test_wheels_are_checked_where_the_python_has_no_pip(folder: Path) -> None:
     assert make("check-arm64", python(folder, "3.12.1"))
+
+
+def test_clean_removes_byte_code_from_every_folder(folder: Path) -> None:
+    tops = (*PACKAGES, "tests", "benchmarks", "tools", "examples")
+    for name in tops:
+        (folder / name / "part/__pycache__").mkdir(parents=True)
+    assert make("clean", python(folder, "3.12.1"))
+    assert not list(folder.rglob("__pycache__"))
 
 
 @pytest.mark.root

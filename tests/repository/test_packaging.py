@@ -18,7 +18,13 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from tests.cli.program import call
-from tools.wheel import Failed, NoRepository, git, require_tag_of_this_version
+from tools.wheel import (
+    Failed,
+    NoRepository,
+    git,
+    require_files_of_the_commit,
+    require_tag_of_this_version,
+)
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
@@ -123,10 +129,10 @@ def test_the_citation_names_the_software_and_the_paper() -> None:
     assert [author["family-names"] for author in paper["authors"]] == ["Xu", "Park"]
 
 
-def repository(folder: Path) -> Path:
-    """A git repository with one commit, which has the tag of another version."""
+def repository(folder: Path, tag: str = "v99.0") -> Path:
+    """A git repository with one commit, which has this tag."""
     settings = ("-c", "user.name=a", "-c", "user.email=a@b", "-c", "commit.gpgsign=false")
-    for words in (["init"], ["commit", "--allow-empty", "-m", "first"], ["tag", "v99.0"]):
+    for words in (["init"], ["commit", "--allow-empty", "-m", "first"], ["tag", tag]):
         command = ["git", "-C", folder, *settings, *words]
         subprocess.run(command, check=True, capture_output=True)
     return folder
@@ -138,6 +144,31 @@ def test_a_tag_of_another_version_is_refused(
     monkeypatch.setattr("tools.wheel.ROOT", repository(tmp_path))
     with pytest.raises(Failed, match=r"has the tag v99\.0"):
         require_tag_of_this_version()
+
+
+@pytest.mark.parametrize("name", ["configs/our_lab.yaml", "examples/all.mcap", "model/notes.txt"])
+def test_a_release_contains_only_files_of_its_commit(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    name: str,
+) -> None:
+    """Hatchling packs what lies there: a rig with a camera's password, a log that git ignores."""
+    tag = f"v{PROJECT['project']['version']}"
+    monkeypatch.setattr("tools.wheel.ROOT", repository(tmp_path, tag))
+    (tmp_path / ".git/info/exclude").write_text("__pycache__\n*.mcap\n")
+    own, compiled = tmp_path / name, tmp_path / "configs/__pycache__/rigs.pyc"
+    for path in (own, compiled):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    with pytest.raises(Failed, match=name):
+        require_files_of_the_commit()
+    git("tag", "--delete", tag)
+    require_files_of_the_commit()
+    assert name in capsys.readouterr().out
+    own.unlink()
+    require_files_of_the_commit()
+    assert not capsys.readouterr().out
 
 
 @pytest.mark.parametrize("program", ["git", "none"])
@@ -156,7 +187,7 @@ def test_a_release_unpacked_in_another_repository_is_not_judged_by_it(
 
 
 @pytest.mark.slow
-def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_the_documentation(
+def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_schemas(
     tmp_path: Path,
 ) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
@@ -176,9 +207,11 @@ def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_the_docu
     }
     assert sessions
     assert sessions <= names
-    parts = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs/schema").glob("*.json")]
-    documentation = {f"cdpr/{path.relative_to(ROOT)}" for path in parts}
-    assert {"cdpr/docs/rig-file.md", "cdpr/docs/faults/late.md"} <= documentation
-    assert documentation <= names
+    faults = {f"executor/faults/{path.name}" for path in (ROOT / "docs/faults").glob("*.md")}
+    assert faults
+    assert faults <= names
+    schemas = {f"cdpr/{p.relative_to(ROOT)}" for p in (ROOT / "docs/schema").glob("*.json")}
+    assert schemas
+    assert schemas <= names
     tops = {name.split("/")[0] for name in names}
     assert tops == {*packages, f"cdpr-{PROJECT['project']['version']}.dist-info"}
