@@ -250,7 +250,7 @@ class MotionInterlock:
                 )
         if now is not None and now.released and not now.lost:
             self.file.write(now.model_copy(update={"released": []}))
-        return None if rehome or reference is None else now
+        return None if reference is None else now
 
     def take(self, reference: HomingReference) -> None:
         """Stores a new reference, made between `begin` and `end`.
@@ -260,6 +260,7 @@ class MotionInterlock:
         """
         if self._is_kept:
             self.file.write(reference)
+            self._counted_from = None  # whose end would replace it
 
     def cancel(self) -> None:
         """Disengages the latch when nothing was enabled after all."""

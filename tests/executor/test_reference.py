@@ -606,6 +606,30 @@ def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() 
     assert "without torque" in MotionInterlock(rig).why_unreferenced()
 
 
+@pytest.mark.parametrize("rehome", [True, False])
+def test_drives_that_a_motion_found_without_torque_and_did_not_enable_never_held(
+    rehome: bool,
+) -> None:
+    """Absolute encoders never homed, as where STO is open."""
+    rig = rig_with("absolute")
+    interlock = MotionInterlock(rig)
+    interlock.found_released((), ALL)
+    interlock.begin(Path("home"), interlock.still_counts([0] * 8), rehome=rehome)
+    assert interlock.why_released((), ALL), "expected to hold, even if this program is killed"
+    interlock.end(State.LATCHED, "STO", Path("home"), holding=True, positions=[0] * 8, released=ALL)
+    MotionInterlock(rig).found_released((), ALL)
+    assert interlock.why_unreferenced() == ""
+
+
+def test_the_end_of_homing_keeps_the_reference_that_it_made() -> None:
+    rig = rig_with("absolute")
+    interlock, made = MotionInterlock(rig), reference_of(rig)
+    interlock.begin(Path("home"), interlock.still_counts([0] * 8), rehome=True)
+    interlock.take(made)
+    _end(interlock)
+    assert interlock.kept_reference() == made
+
+
 @pytest.mark.parametrize("encoder", ["absolute", "incremental"])
 def test_drives_that_were_never_homed_are_not_said_to_have_been(encoder: str) -> None:
     interlock = MotionInterlock(rig_with(encoder))
