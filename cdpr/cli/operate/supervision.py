@@ -265,7 +265,8 @@ class Keys:
 
     def __exit__(self, *_: object) -> None:
         """Discards keys typed but not read: they were not meant for the shell."""
-        termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
+        with suppress(termios.error):  # not an OSError: the terminal was closed
+            termios.tcsetattr(self._input, termios.TCSAFLUSH, self._before)
 
     def pressed(self, wait: float = 0.0) -> list[str]:
         """Keys pressed since the last call: characters, and names as in `NAMES`.
