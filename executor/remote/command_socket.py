@@ -140,7 +140,7 @@ def advertised() -> Iterator[list[socket.socket]]:
         The listening sockets, one per folder.
 
     Raises:
-        Refused: No folder is writable only by this user.
+        Refused: No folder is writable, and only by this user.
     """
     with _advertised(_ENDING) as sockets:
         yield sockets.listeners
@@ -154,21 +154,29 @@ def advertised_ahead() -> contextlib.AbstractContextManager[AdvertisedSockets]:
 @contextlib.contextmanager
 def _advertised(ending: str) -> Iterator[AdvertisedSockets]:
     paths = _made_folders()
+    why = "no such folder belongs to this user alone; another user may have created it"
+    next_step = "remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR"
     with _open_folders(paths) as opened, contextlib.ExitStack() as stack:
-        folders = [folder.descriptor for folder in opened if folder.owner == os.getuid()]
-        if not folders:
+        stem = stack.enter_context(_own_stem())
+        listeners, folders = [], []
+        for folder in (one.descriptor for one in opened if one.owner == os.getuid()):
+            try:
+                listener = stack.enter_context(_listen_in(folder, f"{stem}{ending}"))
+            except OSError as error:  # such as a file system that is full or read-only
+                why = error.strerror or str(error)
+                next_step = "remove the cause, or set XDG_RUNTIME_DIR to a folder without it"
+                continue
+            listeners.append(listener)
+            folders.append(folder)
+            for each in {ending, _ENDING}:
+                stack.callback(_try_remove, folder, f"{stem}{each}")
+        if not listeners:
             raise Refused(
                 "`cdpr stop` would not reach this run",
                 where=" or ".join(map(str, paths)),
-                why="no such folder belongs to this user alone; another user may have created it",
-                next_step="remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR",
+                why=why,
+                next_step=next_step,
             )
-        stem = stack.enter_context(_own_stem())
-        listeners = []
-        for folder in folders:
-            listeners.append(stack.enter_context(_listen_in(folder, f"{stem}{ending}")))
-            for each in {ending, _ENDING}:
-                stack.callback(_try_remove, folder, f"{stem}{each}")
         yield AdvertisedSockets(listeners, folders, stem)
 
 
@@ -331,7 +339,7 @@ def _connect(folder: _Folder, name: str, process: int) -> RunConnection | None:
         link.connect(_path_in(folder.descriptor, name))
     except ConnectionRefusedError:
         link.close()
-        _remove(folder.descriptor, name)
+        _try_remove(folder.descriptor, name)
         return None
     except BlockingIOError:
         return RunConnection(process, link, is_connected=False, is_ahead=is_ahead)

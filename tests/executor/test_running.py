@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import socket
@@ -219,6 +220,62 @@ def test_folder_and_socket_are_closed_to_others(folders):
             (file,) = folder.iterdir()
             assert folder.stat().st_mode & 0o777 == 0o700
             assert file.stat().st_mode & 0o077 == 0
+
+
+READ_ONLY = OSError(errno.EROFS, "Read-only file system")
+
+
+def _refuse_in(monkeypatch: pytest.MonkeyPatch, *refusing: Path) -> None:
+    """Folders in which no socket can be created, as on a failing disk."""
+    for path in refusing:
+        path.mkdir(mode=0o700)
+    inodes, listen = [path.stat().st_ino for path in refusing], command_socket._listen_in
+
+    def listen_in(folder: int, name: str) -> socket.socket:
+        if os.fstat(folder).st_ino in inodes:
+            raise READ_ONLY
+        return listen(folder, name)
+
+    monkeypatch.setattr(command_socket, "_listen_in", listen_in)
+
+
+@pytest.mark.parametrize("k", [0, 1])
+def test_a_folder_in_which_no_socket_can_be_made_is_not_used_while_there_is_another(
+    folders, monkeypatch, k
+):
+    _refuse_in(monkeypatch, folders[k])
+    with advertised() as listeners:
+        assert (len(listeners), _reached()) == (1, [os.getpid()])
+        assert list(folders[k].iterdir()) == []
+    assert list(folders[1 - k].iterdir()) == []
+    with commands_from_start("run", RIG, Supervisor(), realtime=False):
+        assert stop_runs().stopped == (os.getpid(),)
+
+
+def test_a_run_is_refused_where_no_socket_can_be_made(folders, monkeypatch):
+    _refuse_in(monkeypatch, *folders)
+    with pytest.raises(Refused, match="would not reach this run") as caught, advertised():
+        pass
+    assert caught.value.why == "Read-only file system"
+    assert all(str(folder) in caught.value.where for folder in folders)
+
+
+def test_a_socket_that_cannot_be_removed_keeps_no_stop_from_other_runs(folders, monkeypatch):
+    """Left by a program that was killed before its disk failed."""
+    folders[0].mkdir(mode=0o700)
+    with socket.socket(socket.AF_UNIX) as listener:
+        monkeypatch.chdir(folders[0])
+        listener.bind("77.sock")
+    real = os.unlink
+
+    def unlink(name: Any, **where: Any) -> None:
+        if name == "77.sock":
+            raise READ_ONLY
+        real(name, **where)
+
+    monkeypatch.setattr(os, "unlink", unlink)
+    with commands_from_start("run", RIG, Supervisor(), realtime=False):
+        assert stop_runs().stopped == (os.getpid(),)
 
 
 def test_a_link_instead_of_the_socket_is_not_followed(folders, tmp_path):
