@@ -53,7 +53,7 @@ from executor.remote.client import preparations
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
-from executor.supervision import Supervisor
+from executor.supervision import Supervisor, ctrl_c_interrupts
 from model.errors import CdprError, require_child_processes, truth_value
 from model.files.documents import PoseDocument
 from model.pages.page import FactsDisplay
@@ -292,6 +292,7 @@ class ResetResult(FactsDisplay):
         return [*facts, ("reference", str(self.reference))]
 
 
+@ctrl_c_interrupts()
 def reset(
     rig: Rig,
     *,

@@ -5,6 +5,7 @@ The loop reads the operator's requests every cycle.
 
 from __future__ import annotations
 
+import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -229,6 +230,43 @@ class GuardedListener(Listener):
 
 
 _T = TypeVar("_T")
+#: Packages with handlers that note Ctrl-C for an event loop, which a motion in its thread blocks.
+_EVENT_LOOPS = frozenset({"asyncio", "ipykernel", "uvicorn", "uvloop"})
+
+
+@contextmanager
+def ctrl_c_interrupts() -> Iterator[None]:
+    """Replaces the handler of an event loop, so that Ctrl-C raises `KeyboardInterrupt`.
+
+    In a coroutine, Ctrl-C would otherwise have no effect before the next ``await``, so that the
+    platform would still move to the goal. A handler set by the program itself stays.
+    """
+    former = signal.getsignal(signal.SIGINT)
+    is_main = threading.current_thread() is threading.main_thread()  # others may set no handler
+    if former is None or not (is_main and _belongs_to_event_loop(former)):
+        yield
+        return
+
+    def restore() -> None:
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, former)
+
+    try:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        yield
+    finally:
+        try:
+            restore()
+        finally:
+            restore()  # again, as Ctrl-C may have interrupted it
+
+
+def _belongs_to_event_loop(handler: object) -> bool:
+    while isinstance(handler, partial):
+        handler = handler.func
+    owner = type(getattr(handler, "__self__", None))
+    module = getattr(handler, "__module__", None) or owner.__module__  # None: compiled
+    return str(module).partition(".")[0] in _EVENT_LOOPS
 
 
 class Supervisor:

@@ -30,7 +30,7 @@ from executor.realtime.shared_memory import SharedRequests
 from executor.remote.command_socket import advertised_ahead, is_stopped_since
 from executor.remote.protocol import StatusSource, answer_to, status_answer
 from executor.remote.status import NO_PATH, MotionStatus
-from executor.supervision import LocalRequests, RequestBoard, Supervisor
+from executor.supervision import LocalRequests, RequestBoard, Supervisor, ctrl_c_interrupts
 from model.errors import CdprError, StoppedByOperator, require_child_processes
 from model.rig import Rig
 
@@ -293,7 +293,7 @@ def commands_from_start(
         require_child_processes("drives in real time")
     began, operator = time.clock_gettime(time.CLOCK_BOOTTIME), supervisor or Supervisor()
     board: LocalRequests | SharedRequests = SharedRequests() if realtime else LocalRequests()
-    with ExitStack() as outer:
+    with ctrl_c_interrupts(), ExitStack() as outer:
         if isinstance(board, SharedRequests):
             outer.callback(board.close)
         stack = outer.enter_context(ExitStack())

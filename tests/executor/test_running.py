@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import signal
@@ -579,6 +580,79 @@ def test_a_stop_during_the_check_of_a_plan_ends_the_run(folders, tmp_path, monke
         begin[verb](realtime=False)
     assert stopped == [(os.getpid(),)]
     assert list(tmp_path.glob("runs/*")) == []
+
+
+@pytest.mark.parametrize("verb", [*VERBS, "reset"])
+def test_ctrl_c_at_the_question_of_a_verb_in_a_coroutine_ends_it(
+    folders, tmp_path, monkeypatch, verb
+):
+    """The handler of asyncio would only cancel the coroutine at its next ``await``."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(service, "faults_to_release_under", lambda _rig: (None, ()))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    reset = partial(service.reset, RIG.with_bus("udp_multicast", "239.74.9.9"))
+
+    def confirm(_: object) -> bool:
+        signal.raise_signal(signal.SIGINT)
+        return False
+
+    async def main() -> None:
+        before = signal.getsignal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            (VERBS | {"reset": reset})[verb](confirm=confirm)
+        assert signal.getsignal(signal.SIGINT) is before is not signal.default_int_handler
+
+    asyncio.run(main())
+
+
+@pytest.mark.parametrize("verb", ["run", "jog"])
+def test_ctrl_c_during_the_check_of_a_plan_in_a_coroutine_ends_the_run(
+    folders, tmp_path, monkeypatch, verb
+):
+    monkeypatch.chdir(tmp_path)
+    plan = fake_run.make(rate_hz=1.0, every=100, camera=False).context.plan
+
+    def compute(*_: object) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        raise Refused("Ctrl-C had no effect")
+
+    monkeypatch.setattr(runner, "prepare_plan", compute)
+    monkeypatch.setattr(jogging, "plan_straight_move", compute)
+
+    async def main() -> None:
+        if verb == "run":
+            runner.run(plan, plan.rig, cameras=[], realtime=False)
+        else:
+            jogging.jog(VIRTUAL, None, to_home=True, realtime=False)
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(main())
+    assert list(tmp_path.glob("runs/*")) == []
+
+
+@pytest.mark.parametrize("realtime", [False, True])
+def test_ctrl_c_in_a_coroutine_stops_a_motion(folders, realtime):
+    supervisor, paused = Supervisor(), threading.Event()
+
+    async def main() -> None:
+        with commands_from_start("run", RIG, supervisor, realtime=realtime) as commands:
+            status = WinchStatus(RIG, commands.board, simulated_time=not realtime)
+
+            def motion() -> bool:
+                with commands.during_motion(status):
+                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                    for _ in range(100 * ENDS_WITHIN_S):
+                        if commands.board.read().stop:
+                            return True
+                        paused.wait(0.01)
+                return False
+
+            assert supervisor.during(commands.board, motion)
+            supervisor.finish()
+
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(main())
+    assert supervisor.interrupted
 
 
 #: A program at a question to its operator.

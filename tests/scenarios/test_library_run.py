@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import subprocess
@@ -91,19 +92,27 @@ def test_a_no_before_the_motion_leaves_nothing(plan: Plan, rig: Rig, tmp_path: P
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("realtime", [False, True])
+@pytest.mark.parametrize(
+    ("realtime", "coroutine"), [(False, False), (True, False), (False, True), (True, True)]
+)
 def test_ctrl_c_in_a_script_ends_in_a_coordinated_stop_that_is_on_record(
-    plan: Plan, slow_rig: Path, tmp_path: Path, realtime: bool
+    plan: Plan, slow_rig: Path, tmp_path: Path, realtime: bool, coroutine: bool
 ) -> None:
     def press(event: RunEvent) -> None:
         if event.code == "moving":
             os.kill(os.getpid(), signal.SIGINT)
 
-    rig = load_rig(slow_rig)
-    with pytest.raises(KeyboardInterrupt):
+    def move() -> None:
         runner.run(
             plan, rig, folder=tmp_path / "run", cameras=(), realtime=realtime, on_event=press
         )
+
+    async def main() -> None:
+        move()
+
+    rig = load_rig(slow_rig)
+    with pytest.raises(KeyboardInterrupt):
+        asyncio.run(main()) if coroutine else move()
     folder = RunFolder.open(tmp_path / "run")
     assert folder.summary()["verdict"] == "STOPPED"
     assert folder.report.is_file()
