@@ -81,20 +81,20 @@ def test_keys_come_without_enter_and_the_terminal_is_left_as_it_was(
         assert termios.tcgetattr(sys.stdin) == before
 
 
-def hung_up_session(operator: int) -> None:
-    with Keys():
-        os.close(operator)
-        raise StoppedByOperator("stopped; the drives hold")
-
-
 def test_a_closed_terminal_does_not_hide_how_its_session_ended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     operator, program = pty.openpty()
     with os.fdopen(program) as stream:
         monkeypatch.setattr(sys, "stdin", stream)
-        with pytest.raises(StoppedByOperator):
-            hung_up_session(operator)
+        keys = Keys()
+        with pytest.raises(StoppedByOperator), keys:
+            raise _stopped_by_closing(operator)
+
+
+def _stopped_by_closing(terminal: int) -> StoppedByOperator:
+    os.close(terminal)
+    return StoppedByOperator("stopped; the drives hold")
 
 
 def test_a_pipe_has_no_keys(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -636,13 +636,15 @@ def test_ctrl_c_in_a_coroutine_stops_a_motion(folders, realtime):
 
     async def main() -> None:
         with commands_from_start("run", RIG, supervisor, realtime=realtime) as commands:
+            status = WinchStatus(RIG, commands.board, simulated_time=not realtime)
 
             def motion() -> bool:
-                signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-                for _ in range(100 * ENDS_WITHIN_S):
-                    if commands.board.read().stop:
-                        return True
-                    paused.wait(0.01)
+                with commands.during_motion(status):
+                    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+                    for _ in range(100 * ENDS_WITHIN_S):
+                        if commands.board.read().stop:
+                            return True
+                        paused.wait(0.01)
                 return False
 
             assert supervisor.during(commands.board, motion)
