@@ -187,18 +187,7 @@ def image_slopes(camera: Camera, points: Array) -> Array:
     Returns:
         Shape (..., 2, 3), [px/m].
     """
-    return _projection_slopes(camera, points)[0].reshape(*points.shape[:-1], 2, 3)
-
-
-def image_scale(camera: Camera, points: Array) -> float:
-    """Shift in the image by one across the line of sight, RMS over points, [px/m].
-
-    Args:
-        camera: The camera.
-        points: In front of it, camera frame, shape (..., 3), [m].
-    """
-    both_directions = rms(image_slopes(camera, points).reshape(-1, 6))
-    return float(both_directions / np.sqrt(2.0))
+    return np.asarray(_projection_slopes(camera, points)[0].reshape(*points.shape[:-1], 2, 3))
 
 
 def point_slopes(camera: Camera, points: Array) -> Array:
@@ -262,7 +251,8 @@ def undistorted_slopes(camera: Camera, undistorted: Array) -> Array:
 def directions(camera: Camera, undistorted: Array) -> Array:
     """Points of the rays through undistorted pixels, shape (n, 2), 1 m in front; shape (n, 3)."""
     flat = np.asarray(undistorted, dtype=np.float64)
-    return np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(camera.matrix).T
+    rays = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(camera.matrix).T
+    return np.asarray(rays)
 
 
 def distort_pixels(camera: Camera, undistorted: Array) -> Array:

@@ -126,10 +126,7 @@ def _fitting(
 ) -> dict[int, tuple[float, TagView]]:
     """The best-fitting square of each tag with its misfit, where one fits a pose.
 
-    Args:
-        camera: The camera.
-        squares: Tags with their corners in the image, shape (4, 2), [px].
-        pose: ``camera_from_body``.
+    Squares have their corners in the image, shape (4, 2), [px].
     """
     best: dict[int, tuple[float, TagView]] = {}
     for view, seen in squares:
@@ -310,7 +307,7 @@ class PlatformEstimator:
         faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
         edges = sum(int(view.seen.edges.sum()) for view in faced)
         views, bundle = fitted
-        stated = (self._rig.tag_error or 0.0) * bundle.scale
+        stated = (self._rig.tag_error or 0.0) * self._scale(bundle)
         reprojection = math.hypot(self._settings.reprojection_px, stated)
         limits = replace(self._settings, reprojection_px=reprojection)
         elsewhere = self._elsewhere(detected, views, bundle)
@@ -370,12 +367,17 @@ class PlatformEstimator:
         also = f"; detected instead: {', '.join(map(str, others))}" if others else ""
         return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
 
+    def _scale(self, bundle: BundlePose) -> float:
+        """Pixels of the image per metre at the platform's distance, as on the axis."""
+        distance = float(np.linalg.norm(bundle.camera_from_body.position))
+        return float(self._camera.matrix[0, 0]) / distance
+
     def _expected_error(self, bundle: BundlePose) -> float:
         """Mean squared error of an edge, in its variances, with the stated error of the tags.
 
         Where none is stated, that of a careful print.
         """
-        likely = max((self._rig.tag_error or 0.0) / Z_95, LIKELY_TAG_ERROR) * bundle.scale
+        likely = max((self._rig.tag_error or 0.0) / Z_95, LIKELY_TAG_ERROR) * self._scale(bundle)
         return 1.0 + likely**2 * float(np.mean(bundle.certainties))
 
     def _elsewhere(

@@ -21,7 +21,6 @@ from model.cameras import Z_95
 from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
 from model.rig import Camera, Tag
 from tracking.camera_model import (
-    image_scale,
     image_slopes,
     pose_slopes,
     project_undistorted,
@@ -112,19 +111,17 @@ class BundlePose:
         return self.camera_from_body.apply(self.squares.corners)
 
     @cached_property
-    def _slopes(self) -> Array:
-        """Derivatives of the corners in the image by points, shape (t, 4, 2, 3), [px/m]."""
-        return image_slopes(self.squares.camera, self._points)
-
-    @cached_property
     def _variances(self) -> Array:
         """Of the edges' offsets and tilts, 0 where hidden, shape (t, 8), [px²]."""
         squares, depth = self.squares, self._points[..., 2, None, None]
-        by_undistorted = self._slopes[..., :2] * depth / squares.camera.matrix[[0, 1], [0, 1]]
+        focal = squares.camera.matrix[[0, 1], [0, 1]]
+        by_undistorted = image_slopes(squares.camera, self._points)[..., :2] * depth / focal
         whitening = squares.whitening.reshape(-1, 8, 4, 2).swapaxes(1, 2)
         information = np.sum((whitening @ np.linalg.inv(by_undistorted)) ** 2, axis=(1, 3))
         is_measured = np.repeat(squares.edges, 2, axis=1)
-        return np.divide(1.0, information, where=is_measured, out=np.zeros(information.shape))
+        variances = np.zeros(information.shape)
+        np.divide(1.0, information, where=is_measured, out=variances)
+        return variances
 
     @cached_property
     def certainties(self) -> Array:
@@ -142,11 +139,6 @@ class BundlePose:
         offsets = (squares.errors(self.camera_from_body) ** 2 * self._variances)[:, ::2]
         squared = np.where(count == 4, corners**2, offsets.sum(axis=1) / count)
         return float(np.sqrt(np.average(squared, weights=self.certainties)))
-
-    @property
-    def scale(self) -> float:
-        """Shift of the tags in the image by one across the line of sight, [px/m]."""
-        return image_scale(self.squares.camera, self._points)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from model.cameras import Z_95
 from model.errors import BadInput, real_number, require_types
 from model.pose import Array, Pose, interpolate
 from model.rig import Camera, Rig
-from tracking.camera_model import Image, image_scale, require_image_format
+from tracking.camera_model import Image, require_image_format
 from tracking.detection.detector import (
     Detection,
     detect_expected,
@@ -19,7 +19,6 @@ from tracking.detection.detector import (
     nearest_to_expected,
     region_around,
 )
-from tracking.detection.tags import tag_corners
 from tracking.estimator import PlatformEstimator, TrackerSettings
 from tracking.measurement import (
     NoPose,
@@ -73,17 +72,13 @@ class EncoderPrior:
 
 def _stated_error_px(rig: Rig, camera: Camera) -> float:
     """Error of frame tags in an image, 95 %, from the stated error of the camera's pose, [px]."""
-    if camera.pose_covariance is None:
+    covariance = camera.pose_covariance
+    if covariance is None or not rig.frame_tags:
         return 0.0
-    position, turn = largest_deviations(camera.pose_covariance)
-    camera_from_world = camera.world_from_camera.inverse()
-    errors = [0.0]
-    for tag in rig.frame_tags:
-        if region_around(camera, corners := tag_corners(tag), slack=0.0) is not None:
-            points = camera_from_world.apply(corners)
-            distance = float(np.linalg.norm(points.mean(axis=0)))
-            errors.append(image_scale(camera, points) * math.hypot(position, turn * distance))
-    return Z_95 * max(errors)
+    places = np.array([tag.pose.position for tag in rig.frame_tags])
+    nearest = np.linalg.norm(places - camera.world_from_camera.position, axis=1).min()
+    position, turn = largest_deviations(covariance)
+    return float(Z_95 * camera.matrix[0, 0] * math.hypot(position / nearest, turn))
 
 
 class EncoderExtrapolator:

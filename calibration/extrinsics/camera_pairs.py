@@ -114,7 +114,7 @@ def observe_platform(
             bundle.camera_from_body,
             bundle.covariance,
             bundle.reprojection,
-            corners[name],
+            dict(corners[name].items()),
             by_lens,
         )
     return found

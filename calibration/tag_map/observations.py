@@ -284,8 +284,8 @@ class TagViews:
     def image_errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> list[float]:
         """RMS corner error in each image, [px]."""
         points, _, _ = self._points(cameras, tags)
-        measured = np.linalg.solve(self.whitening, self.target[..., None]).reshape(-1, 4, 2)
-        errors = reprojection_errors(self.camera, points, measured)
+        measured: Array = np.asarray(np.linalg.solve(self.whitening, self.target[..., None]))
+        errors = reprojection_errors(self.camera, points, measured.reshape(-1, 4, 2))
         return [float(rms(errors[self.picture == k].reshape(-1, 2))) for k in range(len(cameras))]
 
     def _points(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array, Array]:

@@ -17,10 +17,10 @@ from model.rig import Camera, Rig, Tag
 from tracking.camera_model import image_slopes, pixels_of, point_slopes, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.estimator import TrackerSettings, find_consensus, rejection_reason
+from tracking.estimator import PlatformEstimator, TrackerSettings, find_consensus, rejection_reason
 from tracking.pnp import BundlePose, TagView, solve_pnp
+from tracking.rolling_shutter import RecentMotion
 from tracking.shared_errors import CameraMoved, check_camera, require_unmoved_camera
-from tracking.tracker import _stated_error_px
 
 FOCAL, NOISE = 300.0, 0.08
 ANGLES = (0.0, 60.0, 75.0)
@@ -132,12 +132,15 @@ def test_without_distortion_both_kinds_of_pixels_are_the_same() -> None:
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_stated_errors_of_tags_are_converted_where_the_tags_are(angle: float) -> None:
-    """In the angle's own direction, and across it, where the lens stretches by θ / sin θ."""
+def test_a_stated_error_of_the_tags_is_as_likely_off_the_axis_as_on_it(
+    rig: Rig, angle: float
+) -> None:
     bundle, _ = fitted(fisheye(), angle)
-    radians = max(np.radians(angle), 1e-9)
-    across = radians / np.sin(radians)
-    assert bundle.scale == pytest.approx(FOCAL / 1.2 * np.sqrt((1.0 + across**2) / 2.0), rel=0.03)
+    stated = replace(rig, tag_error=1e-3)
+    estimator = PlatformEstimator(stated, fisheye(), TrackerSettings(), RecentMotion(0.0))
+    pixels = 1e-3 / 1.96 * FOCAL / 1.2
+    expected = 1.0 + (pixels / NOISE) ** 2
+    assert estimator._expected_error(bundle) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -154,21 +157,6 @@ def test_small_tags_agree_within_pixels_of_the_image(angle: float) -> None:
     ]
     found = find_consensus(camera, views, lambda _: True)
     assert [view.tag.id for view in found.views] == [0, 1]
-
-
-@pytest.mark.parametrize("angle", ANGLES)
-def test_a_stated_error_of_the_camera_counts_where_the_frame_tags_are(
-    rig: Rig, angle: float
-) -> None:
-    """1 mrad is 0.3 px along the radius of this lens, and up to 0.41 px across it."""
-    tag = Tag(id=401, size=0.15, pose=facing(angle, 2.0))
-    covariance = np.diag([1e-14] * 3 + [1e-6] * 3)
-    camera = replace(fisheye(), pose_covariance=covariance)
-    seen = replace(rig, frame_tags=(tag,), cameras=(camera,))
-    radians = max(np.radians(angle), 1e-9)
-    across = radians / np.sin(radians)
-    scale = FOCAL * np.sqrt((1.0 + across**2) / 2.0)
-    assert _stated_error_px(seen, camera) == pytest.approx(1.96e-3 * scale, rel=0.01)
 
 
 def around(angle: float, distance: float) -> list[Tag]:
