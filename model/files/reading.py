@@ -62,7 +62,7 @@ def ready_folder(name: str = "configs") -> Path:
 
 
 def docs_page(name: str) -> str:
-    """Path of a page of the documentation, for messages; whoever installed a wheel has no clone."""
+    """Path of a page of the documentation, for messages: an installation from a wheel has no clone."""
     return str(ready_folder("docs") / name)
 
 
@@ -318,7 +318,7 @@ _SHORT, _WIDTH, _HEIGHT, _KIND, _ORIENTATION = 3, 0x100, 0x101, 0xFE, 0x112
 _NO_PAGE = 0b101  # a thumbnail, or a mask
 _MOST_ENTRIES = 1_000_000
 _EXIF_WITHIN = 65536
-"""An EXIF block begins within so many bytes and is no longer, [bytes]."""
+"""An EXIF block begins within this many bytes and is no longer, [bytes]."""
 
 
 def _tiff_entries(data: bytes) -> Iterator[tuple[int, int, int]]:
