@@ -69,8 +69,7 @@ class TrackerSettings:
 # Consensus: which detected squares belong to the body.
 
 
-#: A square agrees with a pose if its corners in the image are this near, as a share of its side,
-#: and [px].
+#: A square agrees with a pose if its corners in the image are this near: share of its side, [px].
 AGREEMENT, LEAST_AGREEMENT = 0.15, 3.0
 #: Poses closer than this are the same, [m].
 SAME = 0.02
