@@ -20,12 +20,12 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime
 from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from model.errors import BadInput, InvalidFile
-from model.files.documents import write_atomic
+from model.files.documents import check_version, write_atomic
 from model.files.output import keep_names
 from model.files.reading import TABLE_LIMIT, parse_json, read_bytes, read_json, read_text
 from model.files.validation import problems_of
@@ -52,7 +52,7 @@ class _Record(BaseModel):
 class EventRecord(BaseModel):
     """One line of ``events.jsonl``."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
+    model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
 
     time_s: Number
     code: str
@@ -222,26 +222,23 @@ class CourseDocument(_Record):
     troubles: list[str] = []
 
 
-def read_summary(path: Path) -> dict[str, Any]:
-    """Reads ``summary.json``, unchanged.
+Record = TypeVar("Record", bound=BaseModel)
+
+
+def read_record(path: Path, model: type[Record]) -> tuple[Record, dict[str, Any]]:
+    """Reads a JSON file of a run folder: checked, and unchanged.
 
     Raises:
-        BadInput: It cannot be read, or is of another version.
-        InvalidFile: It has invalid keys; all are named.
+        BadInput: It cannot be read.
+        InvalidFile: It is of another version, or has invalid keys; all are named.
     """
     data = read_json(path, AGAIN)
-    if not isinstance(data, dict) or data.get("schema_version") != 1:
-        raise BadInput(
-            "not a summary of schema_version 1",
-            where=str(path),
-            next_step="run the plan again with this version of cdpr",
-        )
+    if isinstance(data, dict):
+        check_version(data, model, path, {}, "run the plan again into a new folder")
     try:
-        SummaryDocument.model_validate(data)
+        return model.model_validate(data), data
     except ValidationError as error:
-        problems = problems_of(error, SummaryDocument, {})
-        raise InvalidFile(str(path), problems, AGAIN) from None
-    return data
+        raise InvalidFile(str(path), problems_of(error, model, {}), AGAIN) from None
 
 
 def read_events(path: Path, lines: Sequence[str]) -> list[EventRecord]:
@@ -358,12 +355,7 @@ class RunCourse:
             BadInput: It cannot be read.
             InvalidFile: It has invalid keys; all are named.
         """
-        data = read_json(path, AGAIN)
-        try:
-            kept = CourseDocument.model_validate(data)
-        except ValidationError as error:
-            problems = problems_of(error, CourseDocument, {})
-            raise InvalidFile(str(path), problems, AGAIN) from None
+        kept, _ = read_record(path, CourseDocument)
         values = {one.name: getattr(kept, one.name) for one in fields(cls)}
         values["started"] = datetime.fromisoformat(kept.started)
         values["cameras"] = tuple(

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ValidationError
 
 from executor.recording.checksums import REBUILT, require_unchanged
 from executor.recording.clearance import ClearanceTable
@@ -23,18 +22,18 @@ from executor.recording.csv_columns import TableFile
 from executor.recording.record_files import (
     AGAIN,
     RunCourse,
+    SummaryDocument,
     append_lines,
     read_events,
-    read_summary,
+    read_record,
     whole_lines,
 )
 from executor.recording.tables import CycleTable, FusedTable, PoseTable
-from model.errors import BadInput, Fault, InvalidFile
+from model.errors import BadInput, Fault
 from model.files.documents import write_atomic
 from model.files.plan_file import PlanDocument
-from model.files.reading import IMAGE_LIMIT, read_bytes, read_json
+from model.files.reading import IMAGE_LIMIT, read_bytes
 from model.files.rig_file import RigDocument
-from model.files.validation import problems_of
 from model.plan import Plan, load_plan, save_plan
 from model.rig import Rig, rig_from_document
 
@@ -237,11 +236,7 @@ class RunFolder:
         Raises:
             BadInput: The file was changed.
         """
-        try:
-            document = RigDocument.model_validate(read_json(self.path / RIG, AGAIN))
-        except ValidationError as error:
-            raise InvalidFile(str(self.path / RIG), problems_of(error, RigDocument, {})) from None
-        return rig_from_document(document)
+        return rig_from_document(read_record(self.path / RIG, RigDocument)[0])
 
     def write_cycles(self, table: CycleTable) -> None:
         """Writes ``cycles.csv``."""
@@ -340,7 +335,7 @@ class RunFolder:
         Raises:
             BadInput: It is not JSON, of another version, or damaged.
         """
-        return read_summary(self.path / SUMMARY)
+        return read_record(self.path / SUMMARY, SummaryDocument)[1]
 
     def append_event(self, event: RunEvent) -> None:
         """Appends a line to ``events.jsonl``; it is on disk when this returns.

@@ -273,7 +273,7 @@ CLEARANCE_FACTS = (
         ("clearance.csv", "time_s\nsoon\n", "'time_s' has a value that is not a number"),
         ("clearance.csv", f"{CLEARANCE_FACTS},pillar_mm\n", "'pillar_mm' lacks its partner"),
         ("summary.json", "{", "not valid JSON"),
-        ("summary.json", '{"schema_version": 2}', "schema_version 1"),
+        ("summary.json", '{"schema_version": 2}', "this program reads version 1"),
         ("rig.json", "{}", "this key is missing"),
     ],
 )

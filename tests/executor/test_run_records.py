@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from executor.recording.record_files import RunCourse
-from executor.recording.run_folder import RunFolder
+from executor.recording.run_folder import RunEvent, RunFolder
 from executor.report.run_data import read_run
 from model.errors import BadInput, InvalidFile
 from tests.executor import fake_run
@@ -49,6 +49,36 @@ def test_what_a_run_writes_is_read_as_it_is(folder: RunFolder) -> None:
 def test_a_key_of_a_later_version_is_left_alone(folder: RunFolder) -> None:
     changed(folder, "weather", {"sunny": True})
     assert folder.summary()["weather"] == {"sunny": True}
+
+
+def test_a_key_of_a_later_version_in_an_event_is_ignored(folder: RunFolder) -> None:
+    event = {"time_s": 1.0, "code": "moving", "text": "It moves.", "cable": 3}
+    changed(folder, "events", [event])
+    assert folder.summary()["events"] == [event]
+    path = folder.path / "events.jsonl"
+    path.write_text(path.read_text() + json.dumps(event) + "\n")
+    assert folder.events()[-1] == RunEvent(1.0, "moving", "It moves.")
+
+
+@pytest.mark.parametrize("name", ["summary.json", "run.json", "rig.json", "plan.json"])
+@pytest.mark.parametrize("version", [2, True])
+def test_a_file_of_another_version_is_named_with_what_to_do(
+    folder: RunFolder, name: str, version: int
+) -> None:
+    """An older copy of the file would not help with a later one."""
+    path = folder.path / name
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"schema_version": version}))
+    readers = {
+        "summary.json": folder.summary,
+        "run.json": folder.course,
+        "rig.json": folder.rig,
+        "plan.json": folder.plan,
+    }
+    with pytest.raises(InvalidFile, match=f"schema version {version}") as caught:
+        readers[name]()
+    later = "use the version of cdpr that wrote the file, or "
+    assert caught.value.next_step.startswith(later) is (version == 2)
+    assert "copy" not in caught.value.next_step
 
 
 @pytest.mark.parametrize(
