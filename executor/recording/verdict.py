@@ -21,7 +21,7 @@ from executor.safety.limits import tension_limits
 from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
 from model.plan import Plan
-from model.pose import Pose
+from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene
 from tracking.clearance import INTERVAL
@@ -118,7 +118,7 @@ def judge(
     warnings = dict.fromkeys(t.removesuffix(NO_MORE) for t in context.texts_of("drive_warning"))
     measured = [
         following(cycles, rig.motion.following_error),
-        replies(cycles, course.simulated, bool(context.texts_of("drive_silent"))),
+        replies(cycles, context),
         *tensions(cycles, rig),
         *distances(clearance, scene.obstacle_clearance, course.cameras, began),
         *encoder_pose(cycles),
@@ -134,7 +134,7 @@ def judge(
             many = f"{len(failures)} checks" if len(failures) > 1 else "one check"
             sentence = f"The run reached the goal, but {many} failed."
             return Verdict(FAILED, sentence, (end, *measured))
-        sentence = "The run reached the goal within every limit that was measured."
+        sentence = "The run reached the goal and met every check."
         return Verdict(PASSED, sentence, (end, *measured))
     if final_state == NOT_ENDED:
         end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
@@ -233,18 +233,20 @@ def _rounded_up(length: float) -> float:
     return max(math.ceil(round(length * 1e6, 3)), 1) / 1e3
 
 
-def replies(cycles: CycleTable, simulated: bool, silent: bool = False) -> Check:
+def replies(cycles: CycleTable, context: RunContext) -> Check:
     """Check for lost replies: none from simulated drives; on a bus none that caused a stop."""
     lost = int(cycles.missing.sum())
     asked = len(cycles) * cycles.cable_count
     if not lost:
         return Check("lost_replies", True, f"All {asked} replies of the drives arrived.")
     text = f"{lost} of {asked} replies of the drives were lost"
-    if silent:
+    if context.texts_of("drive_silent"):
         return Check("lost_replies", False, f"{text}, and the run was stopped for it.")
-    if simulated:
+    if context.course.simulated:
         return Check("lost_replies", False, f"{text}; simulated drives lose none.")
-    return Check("lost_replies", True, f"{text}, too few to stop the run.")
+    if context.course.final_state in ("finished", "stopped"):  # else a drive may be gone
+        text += ", too few to stop the run"
+    return Check("lost_replies", True, f"{text}.")
 
 
 def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
@@ -252,22 +254,18 @@ def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
     if not np.isfinite(cycles.tensions).any():
         return []
     low, high = float(np.nanmin(cycles.tensions)), float(np.nanmax(cycles.tensions))
-    limits = f"limits {rig.min_tension:g} and {rig.max_tension:g} N"
     slack, overload = tension_limits(rig)
-    if low < slack:
-        at, cable = _where(cycles.tensions, low)
-        text = f"Cable {cable} went slack: {low:.2f} N at {cycles.time[at]:.2f} s ({limits})."
-        return [Check("tension", False, text)]
-    if high > overload:
-        at, cable = _where(cycles.tensions, high)
-        text = f"Cable {cable} pulled {high:.2f} N at {cycles.time[at]:.2f} s ({limits})."
+    limits = f"limits {rig.min_tension:g} and {rig.max_tension:g} N"
+    limits += f"; a run fails below {slack:g} or above {overload:g} N"
+    if low < slack or high > overload:
+        value, what = (low, "went slack:") if low < slack else (high, "pulled")
+        at, cable = _where(cycles.tensions, value)
+        text = f"Cable {cable} {what} {value:.2f} N at {cycles.time[at]:.2f} s ({limits})."
         return [Check("tension", False, text)]
     return [Check("tension", True, f"Tensions stayed in {low:.1f} to {high:.1f} N ({limits}).")]
 
 
-def _where(
-    values: np.ndarray[tuple[int, ...], np.dtype[np.float64]], value: float
-) -> tuple[int, int]:
+def _where(values: Array, value: float) -> tuple[int, int]:
     row, column = np.argwhere(values == value)[0]
     return int(row), int(column) + 1
 
@@ -306,8 +304,9 @@ def _against_required(rows: ClearanceTable, required: float, source_name: str) -
     if not passed:  # rounded down, so that they do not look like the required one
         low, distance, high = (math.floor(round(x * 10.0, 6)) / 10.0 for x in (low, distance, high))
     bounds = f"{INTERVAL} {low:.1f} to {high:.1f} mm"
+    subject = "Smallest clearance" if passed else "Clearance"  # a less certain one may be smaller
     text = (
-        f"Smallest clearance measured by {source_name}: {distance:.1f} mm, {bounds}"
+        f"{subject} measured by {source_name}: {distance:.1f} mm, {bounds}"
         f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
         f" required {required * 1e3:g} mm."
     )
@@ -322,7 +321,7 @@ def _against_plan(rows: ClearanceTable) -> Check:
     short, at_most = shortfall[worst] * 1e3, rows.at_most[worst] * 1e3
     text = (
         f"Measured clearance was at most {max(short, 0.0):.2f} mm below the planned one,"
-        f" within its {INTERVAL} of ± {at_most - rows.distance[worst] * 1e3:.2f} mm there."
+        f" where its {INTERVAL} extends {at_most - rows.distance[worst] * 1e3:.2f} mm upwards."
         if passed
         else f"Measured clearance was {short:.2f} mm below the planned one at"
         f" {rows.time[worst]:.1f} s: its {INTERVAL} ends at {at_most:.2f} mm,"

@@ -67,6 +67,7 @@ def joined(*tables: ClearanceTable) -> ClearanceTable:
 def test_a_good_run_passes_and_says_by_how_much(run: fake_run.FakeRun) -> None:
     made = run.summary
     assert (made["verdict"], made["passed"]) == ("PASSED", True)
+    assert made["sentence"] == "The run reached the goal and met every check."
     assert any("limit 2 mm" in reason for reason in made["reasons"])
     assert all(any(sign.isdigit() for sign in reason) for reason in made["reasons"])
 
@@ -248,9 +249,26 @@ def test_lost_replies_fail_simulated_drives_and_are_reported_on_a_bus(
 ) -> None:
     missing = run.cycles.missing.copy()
     missing[3] = 2
-    check = replies(replace(run.cycles, missing=missing), simulated)
+    context = fake_run.changed(run.context, simulated=simulated)
+    check = replies(replace(run.cycles, missing=missing), context)
     assert check.passed is passed
     assert check.text.startswith("2 of ")
+
+
+@pytest.mark.parametrize(
+    ("final_state", "few"),
+    [("finished", True), ("stopped", True), ("latched", False), ("not_ended", False)],
+)
+def test_replies_lost_in_a_run_that_ended_with_a_fault_are_not_called_few(
+    run: fake_run.FakeRun, final_state: str, few: bool
+) -> None:
+    """As of a drive that restarted and then was silent to the end."""
+    missing = (np.arange(len(run.cycles)) >= 150).astype(int)
+    context = fake_run.changed(run.context, simulated=False, final_state=final_state)
+    check = replies(replace(run.cycles, missing=missing), context)
+    assert check.passed
+    assert ("too few" in check.text) is few
+    assert check.text.startswith(f"{len(run.cycles) - 150} of ")
 
 
 @pytest.mark.parametrize(
@@ -264,6 +282,7 @@ def test_a_slack_or_overloaded_cable_fails_and_is_named(
     (check,) = tensions(replace(run.cycles, tensions=changed), run.context.rig)
     assert check.passed is passed
     assert passed or f"Cable 5 {'went slack' if tension < 5 else 'pulled'}" in check.text
+    assert "limits 5 and 100 N; a run fails below 2.5 or above 102 N" in check.text
 
 
 def test_drives_whose_positions_fit_no_pose_on_the_path_fail_the_run(run: fake_run.FakeRun) -> None:
@@ -378,6 +397,26 @@ def test_one_bad_row_among_good_ones_is_found(run: fake_run.FakeRun) -> None:
     check = distances(both, 0.010)[0]
     assert not check.passed
     assert "9.9 mm, 95 % interval 9.8 to 9.9 mm" in check.text
+
+
+def test_only_the_smallest_clearance_is_called_so() -> None:
+    """A less certain one may be smaller than the one that fails."""
+    table = joined(rows("tag", 5.0, 20.0, 5.0), rows("tag", 18.0, 1.0, 18.0))
+    failed, passed = (distances(table, required)[0] for required in (0.020, 0.010))
+    assert not failed.passed
+    assert "Clearance measured by the camera: 18.0 mm, 95 % interval 17.0 to" in failed.text
+    assert "mallest" not in failed.text
+    assert passed.passed
+    assert "Smallest clearance measured by the camera: 5.0 mm" in passed.text
+
+
+def test_an_interval_with_two_halves_is_not_given_by_one_of_them() -> None:
+    table = replace(rows("tag", 20.0, 4.0, 20.4), at_most=np.array([0.0206]))
+    check = distances(table, 0.010)[1]
+    assert check.passed
+    assert "±" not in check.text
+    assert "at most 0.40 mm below the planned one" in check.text
+    assert "extends 0.60 mm upwards" in check.text
 
 
 def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRun) -> None:

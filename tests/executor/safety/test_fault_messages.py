@@ -93,7 +93,8 @@ def test_a_run_that_was_stopped_for_silent_drives_did_not_lose_few_replies() -> 
     cycles = replace(run.cycles, missing=run.cycles.missing + 1)
     event = RunEvent(1.0, "drive_silent", "all 8 drives did not answer for 2 cycles")
     for codes, passed in (((), True), ((event,), False)):
-        changes = {"simulated": False, "events": codes, "final_state": "latched"}
+        state = "finished" if passed else "latched"
+        changes = {"simulated": False, "events": codes, "final_state": state}
         context = fake_run.changed(run.context, **changes)
         checks = summarize(context, cycles, run.poses, run.clearance)["checks"]
         (check,) = (check for check in checks if check["name"] == "lost_replies")
