@@ -234,7 +234,7 @@ def read_record(path: Path, model: type[Record]) -> tuple[Record, dict[str, Any]
     """
     data = read_json(path, AGAIN)
     if isinstance(data, dict):
-        check_version(data, model, path, {}, AGAIN)
+        check_version(data, model, path, {}, "run the plan again into a new folder")
     try:
         return model.model_validate(data), data
     except ValidationError as error:

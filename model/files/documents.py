@@ -324,8 +324,8 @@ def check_version(
     if version != known or isinstance(version, bool):
         what = f"the file has schema version {version}; this program reads version {known}"
         hint = next_step or f"bring the file to version {known}, or use the program it was made for"
-        if version > known:
-            hint = "use the version of cdpr that wrote the file, or a later one"
+        if next_step and version > known:
+            hint = f"use the version of cdpr that wrote the file, or {next_step}"
         raise InvalidFile(str(path), [Problem(key, what, *position_of((key,), positions))], hint)
 
 
