@@ -249,9 +249,9 @@ def _unstated_gamma(rig: Rig, camera: Camera) -> str:
 
 
 def home_remarks(rig: Rig) -> list[str]:
-    """Why the cables cannot hold the platform at home, or are too near to each other or to it there.
+    """Why no motion can begin at the platform's home; empty if one can.
 
-    Too near is what a scene refuses by default. Empty if a motion can begin at home.
+    The cables cannot hold it, or are nearer to it or each other than a scene allows by default.
     """
     from model.clearance import ClearanceModel  # needs python-fcl
 
