@@ -240,7 +240,8 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
             f"at the {name} {near.first} is {gap} mm from {near.second},"
             f" less than the required {least} mm"
         )
-    why = f"the scene's clearance.{key} plus 0.05 mm that the planner keeps in reserve"
+    given = "" if key == "self_mm" else ", or --clearance-mm of `cdpr plan` and `cdpr jog`,"
+    why = f"the scene's clearance.{key}{given} plus 0.05 mm that the planner keeps in reserve"
     next_step = f"move the {name} or the obstacle, or reduce the clearance"
     values: dict[str, float | str] = {
         "distance_mm": distance,

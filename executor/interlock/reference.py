@@ -293,5 +293,5 @@ class ReferenceStatus:
         if not self.counts:
             return f"not valid: {self.why_not}"
         if not self.made:
-            return "none: absolute encoders match the rig file"
+            return "none: the drives count as in the rig file"
         return f"valid, made {self.made} ({self.how})"

@@ -181,3 +181,7 @@ def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_pa
     counting = tmp_path / "rig.yaml"
     counting.write_text(RIG.read_text().replace("encoder: absolute, ", ""))
     one_message(call("home", counting, "--as-rig-file", *bus, "--yes"), 3, "never homed")
+    simulated = call("home", counting, "--as-rig-file")
+    assert simulated.code == 0, simulated
+    assert "none: the drives count as in the rig file" in simulated.said
+    assert "absolute" not in simulated.said

@@ -103,7 +103,7 @@ def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
     MotionInterlock(rig).file.write(reference_of(rig))
     use_rig_file_counts(rig, confirm=confirm)
     none, one = asked
-    assert none == "homing reference: none: absolute encoders match the rig file"
+    assert none == "homing reference: none: the drives count as in the rig file"
     assert one.startswith("the present homing reference, which would be discarded: valid, made")
     assert MotionInterlock(rig).kept_reference() is None
 
@@ -625,7 +625,7 @@ def test_drives_that_were_never_homed_count_as_in_the_rig_file_whatever_it_was_b
     found = changed.require_ready()
     assert found is not None
     assert found.home_counts == [77] * 8
-    assert str(reference_status(changed)) == "none: absolute encoders match the rig file"
+    assert str(reference_status(changed)) == "none: the drives count as in the rig file"
     relative = MotionInterlock(rig_with("incremental"))
     for ask in (relative.reference, relative.require_ready):
         with pytest.raises(Refused, match="never homed"):

@@ -319,12 +319,21 @@ def test_an_obstacle_at_an_outlet_is_named_instead_of_the_start(
     assert ("reduce clearance.obstacle_mm" in refusal.value.next_step) == reduced
 
 
+def test_the_clearance_of_an_obstacle_is_named_as_every_verb_takes_it(gachon, scene_with) -> None:
+    """A jog with `--clearance-mm` was sent to the scene file."""
+    block = {"name": "block", "box": {"size_mm": [80.0] * 3}, "position_mm": [0.0, 0.0, 300.0]}
+    with pytest.raises(BadInput, match=r"at the start .* block") as refusal:
+        require_usable_ends(gachon, scene_with(block, clearance={"obstacle_mm": 100.0}))
+    assert "clearance.obstacle_mm, or --clearance-mm of `cdpr plan`" in refusal.value.why
+
+
 def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_with) -> None:
     """Crossing cables may be moved apart; those from one anchor are near whatever the pose."""
     crossing = replace(scene_with(), self_clearance=0.017)
     with pytest.raises(BadInput, match=r"cable \d is .* mm from cable \d") as refusal:
         require_usable_ends(gachon, crossing)
     assert "share" not in refusal.value.why
+    assert "--clearance-mm" not in refusal.value.why
     assert refusal.value.next_step.startswith("move the start, or reduce clearance.self_mm")
     outlets = gachon.document.outlets_mm
     document = gachon.document.model_copy(update={"outlets_mm": [*outlets[1::-1], *outlets[2:]]})
