@@ -24,7 +24,8 @@ import numpy as np
 from executor import runner
 from executor.recording.run_folder import RunFolder
 from model.errors import CdprError
-from model.files.examples import PAPER_RIG, ready_folder
+from model.files.examples import PAPER_RIG
+from model.files.reading import ready_folder
 from model.plan import load_plan, save_plan
 from model.rig import Rig, load_rig
 from model.scene import load_scene

@@ -40,7 +40,8 @@ from executor.recording.run_folder import RunFolder
 from executor.remote.status import RunStatus
 from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import BadInput, CdprError
-from model.files.examples import PAPER_RIG, ready_folder
+from model.files.examples import PAPER_RIG
+from model.files.reading import ready_folder
 from model.plan import load_plan, save_plan
 from model.pose import Array
 from model.rig import Rig, load_rig, rig_from_document

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from model.cameras import CalibrationResult, Camera, Tag, camera_from, corrected, tag_from
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, load_yaml, millimetres
+from model.files.reading import docs_page
 from model.files.rig_file import BusDocument, MotionDocument, RigDocument, WinchDocument
 from model.files.validation import key_path
 from model.pages.page import html_table
@@ -253,8 +254,8 @@ class Rig(ReadOnly):
             raise BadInput(
                 "the rig file has no camera",
                 where=self.name,
-                next_step="add `tags` and `cameras`, as in the example of docs/rig-file.md"
-                " (Tags and cameras)",
+                next_step="add `tags` and `cameras`, as in the example of"
+                f" {docs_page('rig-file.md')} (Tags and cameras)",
             )
         if name is None:
             return self.cameras[0]

@@ -30,7 +30,7 @@ from model.errors import (
     require_not_empty,
     without_passwords,
 )
-from model.files.reading import shown
+from model.files.reading import ready_folder, shown
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +206,7 @@ def joined_points(arguments: Sequence[str]) -> list[str]:
 EPILOG = (
     "Exit codes: 0 ok, 1 fault, 2 bad input, 3 refused by a safety check,"
     " 4 hardware missing, 130 stopped by the operator."
+    f"\n\nDocumentation (docs/ in help texts): {ready_folder('docs')}"
 )
 
 

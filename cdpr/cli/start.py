@@ -15,12 +15,12 @@ from model.files.documents import write_atomic
 from model.files.examples import (
     copy_examples,
     find_examples,
-    ready_folder,
     rig_text,
     select_examples,
 )
 from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
 from model.files.output import require_new_file
+from model.files.reading import ready_folder
 from model.kinematics import NoCable
 from model.rig import Rig, load_rig
 from model.statics.gravity import working_tensions

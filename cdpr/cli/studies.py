@@ -13,8 +13,9 @@ from cdpr.cli.arguments import flag, option, required
 from cdpr.cli.options import RIG, Quaternion, Triple, rotation_of
 from cdpr.cli.output import Terminal, out, present, show_json, show_line
 from model.files.documents import millimetres
-from model.files.examples import PAPER_RIG, ready_folder
+from model.files.examples import PAPER_RIG
 from model.files.output import make_folder
+from model.files.reading import ready_folder
 from model.rig import load_rig
 from model.scene import load_scene
 from planner.campaign.evaluation import about, run_campaign, write_campaign

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import BadInput, require_not_empty, sequence_of
-from model.files.reading import is_folder
+from model.files.reading import docs_page, is_folder
 from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
@@ -36,8 +36,9 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
         raise BadInput(
             "the rig file has no camera or no tags",
             where=rig.name,
-            next_step="add cameras and tags to the rig file, as in the example of docs/rig-file.md,"
-            " or run without a camera: --no-camera, in Python cameras=[]",
+            next_step="add cameras and tags to the rig file, as in the example of"
+            f" {docs_page('rig-file.md')}, or run without a camera: --no-camera, in Python"
+            " cameras=[]",
         )
     if wanted is None:
         if not in_process:

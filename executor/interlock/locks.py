@@ -19,6 +19,7 @@ from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
 from model.errors import HardwareMissing, Refused
+from model.files.reading import docs_page
 
 #: Used by all users if it exists: ``sudo install -d -m 2775 -g GROUP /var/lib/cdpr``.
 SHARED = Path("/var/lib/cdpr")
@@ -30,7 +31,7 @@ SHORTEST_SERIAL = 5
 #: What to do if a file of the state folder cannot be written.
 WRITABLE = (
     "make the folder writable for the operators of the rig; if its file system is the cause, keep"
-    " it on a local disk (docs/commissioning.md)"
+    f" it on a local disk ({docs_page('commissioning.md')})"
 )
 #: A latch, or a reference of many cables, has a few kilobytes.
 LARGEST_FILE = 65_536
@@ -258,8 +259,9 @@ def locked_within(handle: int, seconds: float, operation: int = fcntl.LOCK_EX) -
                 " the same drives",
                 where=str(state_folders()[0]),
                 why=error.strerror or str(error),
-                next_step="create /var/lib/cdpr on a local disk (docs/commissioning.md), or set"
-                " XDG_STATE_HOME to a folder of one; nothing was moved",
+                next_step="create /var/lib/cdpr on a local disk"
+                f" ({docs_page('commissioning.md')}), or set XDG_STATE_HOME to a folder of one;"
+                " nothing was moved",
             ) from None
         else:
             return True

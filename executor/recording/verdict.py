@@ -7,11 +7,9 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from pathlib import Path
 
 import numpy as np
 
-import executor
 from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord, RunCourse
 from executor.recording.run_folder import RunEvent
@@ -20,6 +18,7 @@ from executor.safety.fault_messages import NO_MORE
 from executor.safety.limits import tension_limits
 from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
+from model.files.reading import ready_folder
 from model.plan import Plan
 from model.pose import Pose
 from model.rig import Rig
@@ -407,7 +406,8 @@ def page_of(code: str) -> str:
 
 def fault_codes() -> list[str]:
     """Codes of all faults that have a page."""
-    return sorted(path.stem for path in _folder().glob("*.md") if path.stem != "index")
+    pages = ready_folder("docs/faults").glob("*.md")
+    return sorted(page.stem for page in pages if page.stem != "index")
 
 
 def faults_among(codes: Iterable[str]) -> list[str]:
@@ -419,7 +419,7 @@ def faults_among(codes: Iterable[str]) -> list[str]:
 
 def page_text(code: str) -> str:
     """The page about a fault of `fault_codes`, as Markdown without links."""
-    text = (_folder() / f"{code}.md").read_text(encoding="utf-8")
+    text = (ready_folder("docs/faults") / f"{code}.md").read_text(encoding="utf-8")
     return re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", text)
 
 
@@ -441,10 +441,3 @@ def fault_titles() -> dict[str, str]:
     """Titles of all pages about faults, by code."""
     first_lines = ((code, page_text(code).split("\n", 1)[0]) for code in fault_codes())
     return {code: line.removeprefix("# ") for code, line in first_lines}
-
-
-def _folder() -> Path:
-    """Folder of the pages: in a wheel in the package, in the repository in ``docs``."""
-    package = Path(executor.__file__).resolve().parent
-    inside = package / "faults"
-    return inside if inside.is_dir() else package.parent / "docs" / "faults"

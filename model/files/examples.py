@@ -17,7 +17,7 @@ from model.errors import AlreadyExists, BadInput
 from model.files.documents import write_atomic, write_bytes_atomic
 from model.files.new_rig import Answers, shown_value
 from model.files.output import make_missing_folder
-from model.files.reading import read_bytes, read_text, shown
+from model.files.reading import read_bytes, read_text, ready_folder, shown
 from model.files.rig_file import RigDocument
 from model.files.validation import key_path, parse_yaml, problems_of
 
@@ -50,17 +50,6 @@ class Example:
     def file_name(self) -> str:
         """Name of a copy."""
         return self.source.name
-
-
-def ready_folder(name: str = "configs") -> Path:
-    """The folder of the example rigs and scenes: in the package `cdpr`, or in the repository.
-
-    Args:
-        name: ``examples`` for the recorded sessions instead, ``docs/schema`` for the schemas.
-    """
-    root = Path(__file__).resolve().parents[2]
-    inside = root / "cdpr" / name
-    return inside if inside.is_dir() else root / name
 
 
 def find_examples(configs: Path, sessions: Path) -> list[Example]:
@@ -169,6 +158,7 @@ def rig_text(answers: Answers) -> str:
     text = _TEMPLATE.format(
         **{key: _yaml(value) for key, value in answers.items()},
         schema=_schema("rig"),
+        pages=ready_folder("docs"),
         outlets=_lines(answers["outlets_mm"]),
         anchors=_lines(answers["anchors_mm"]),
         winches="\n".join(_winch(number, answers) for number in range(1, answers["cables"] + 1)),
@@ -221,7 +211,7 @@ def _winch(number: int, answers: Answers) -> str:
 _TEMPLATE = """\
 # yaml-language-server: $schema={schema}
 # The rig {name}, written by `cdpr new`. What every key means, and the keys left out here:
-# docs/rig-file.md. Lengths in mm, forces in N, masses in kg; the world frame has z up.
+# {pages}/rig-file.md. Lengths in mm, forces in N, masses in kg; the world frame has z up.
 schema_version: 1
 name: {name}
 
@@ -273,5 +263,5 @@ bus:
   bitrate: {bitrate}
   cycle_ms: 10
 
-# Tags on the platform and cameras, to measure its pose: docs/rig-file.md.
+# Tags on the platform and cameras, to measure its pose: {pages}/rig-file.md.
 """

@@ -47,9 +47,26 @@ TABLE_LIMIT = table_limit(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE
 """Largest table of a run that this computer reads, [bytes]."""
 
 
+def ready_folder(name: str = "configs") -> Path:
+    """A folder that is installed beside the code: in the package `cdpr`, or in the repository.
+
+    Args:
+        name: ``configs`` for the example rigs and scenes, ``examples`` for the recorded sessions,
+            ``docs`` for the documentation, ``docs/schema`` for the schemas.
+    """
+    root = Path(__file__).resolve().parents[2]
+    inside = root / "cdpr" / name
+    return inside if inside.is_dir() else root / name
+
+
+def docs_page(name: str) -> str:
+    """Path of a page of the documentation, for messages: a user of the wheel has no clone."""
+    return str(ready_folder("docs") / name)
+
+
 SHORTEN = (
     "shorten the file; in a scene, simplify meshes or replace them by convex hulls"
-    " (docs/scene-file.md)"
+    f" ({docs_page('scene-file.md')})"
 )
 _SHORTENED = {
     TABLE_LIMIT: "check the path; a computer with more memory reads larger tables",

@@ -11,8 +11,9 @@ from typing import Any
 
 import typer
 
-from cdpr.cli.app import build_app
+from cdpr.cli.app import EPILOG, build_app
 from executor.doctor import PACKAGES
+from model.files.reading import docs_page
 
 ROOT = Path(__file__).parents[2]
 COMMAND = re.compile(r"(?:^|`|sudo )cdpr ([a-z][^`;]*)")
@@ -73,6 +74,33 @@ def problem(command: str) -> str:
     known = {option for p in verb.params for option in (*p.opts, *p.secondary_opts)} | {"--help"}
     wanted = {w.split("=")[0].rstrip(".,:)") for w in words if re.match(r"--?[a-z]", w)}
     return f"no option {sorted(wanted - known)}" if wanted - known else ""
+
+
+PAGE = re.compile(r"docs/[\w/-]+\.md")
+RELATIVE = {
+    "cdpr/cli/calibrate/rig.py": "a help text: `cdpr --help` states where docs/ is",
+    "cdpr/cli/plan.py": "a help text, too",
+    "planner/parallel.py": "about a source checkout",
+}
+
+
+def test_a_page_that_a_message_names_is_found_from_any_folder() -> None:
+    """With a wheel there is no folder docs; messages name pages by `docs_page`."""
+    found = set()
+    for path in (p for package in PACKAGES for p in (ROOT / package).rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        docstrings = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        said = (node for node in ast.walk(tree) if id(node) not in docstrings)
+        texts_said = (n.value for n in said if isinstance(n, ast.Constant))
+        if any(isinstance(text, str) and PAGE.search(text) for text in texts_said):
+            found.add(str(path.relative_to(ROOT)))
+    assert found == set(RELATIVE)
+    named = re.compile(r"docs_page\('([\w/-]+\.md)'\)")
+    sources = [p.read_text() for package in PACKAGES for p in (ROOT / package).rglob("*.py")]
+    pages = {page for text in sources for page in named.findall(text)}
+    assert len(pages) >= 4
+    assert all(Path(docs_page(page)).is_file() for page in pages)
+    assert Path(EPILOG.rpartition(": ")[2]) == ROOT / "docs"
 
 
 def test_commands_are_found() -> None:

@@ -123,7 +123,7 @@ def test_the_citation_names_the_software_and_the_paper() -> None:
 
 
 @pytest.mark.slow
-def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_schemas(
+def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_the_documentation(
     tmp_path: Path,
 ) -> None:
     command = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
@@ -143,11 +143,9 @@ def test_a_wheel_holds_every_package_its_type_marker_the_ready_rigs_and_schemas(
     }
     assert sessions
     assert sessions <= names
-    faults = {f"executor/faults/{path.name}" for path in (ROOT / "docs/faults").glob("*.md")}
-    assert faults
-    assert faults <= names
-    schemas = {f"cdpr/{p.relative_to(ROOT)}" for p in (ROOT / "docs/schema").glob("*.json")}
-    assert schemas
-    assert schemas <= names
+    parts = [*(ROOT / "docs").rglob("*.md"), *(ROOT / "docs/schema").glob("*.json")]
+    documentation = {f"cdpr/{path.relative_to(ROOT)}" for path in parts}
+    assert {"cdpr/docs/rig-file.md", "cdpr/docs/faults/late.md"} <= documentation
+    assert documentation <= names
     tops = {name.split("/")[0] for name in names}
     assert tops == {*packages, f"cdpr-{PROJECT['project']['version']}.dist-info"}

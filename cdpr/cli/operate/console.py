@@ -14,14 +14,15 @@ from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.run import supervise
 from cdpr.cli.operate.supervision import handling
 from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
-from cdpr.cli.output import Terminal, out, show_facts, show_line
+from cdpr.cli.output import Terminal, show_facts, show_line
 from cdpr.console.session import Console
 from cdpr.console.verbs import ConsoleFiles
 from executor import runner
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import RunFolder
 from model.errors import BadInput, HardwareMissing
-from model.files.examples import PAPER_RIG, ready_folder
+from model.files.examples import PAPER_RIG
+from model.files.reading import docs_page, ready_folder
 from model.plan import plan_facts, plan_from_document, save_plan
 from model.rig import load_rig
 from model.scene import load_scene
@@ -157,5 +158,5 @@ def demo(
         return
     plan = plan_from_document(document)
     code = supervise(partial(runner.run, plan, rig, folder=folder, realtime=False), rig)
-    out.print("next: open the report in a browser; your own rig: docs/your-own-rig.md")
+    show_line(f"next: open the report in a browser; your own rig: {docs_page('your-own-rig.md')}")
     raise typer.Exit(code)
