@@ -163,6 +163,11 @@ class Rig(ReadOnly):
         """Number of cables m."""
         return len(self.outlets)
 
+    @property
+    def is_tracked(self) -> bool:
+        """Whether it has cameras and tags on the platform, so that a run can be measured."""
+        return bool(self.cameras and self.platform_tags)
+
     @cached_property
     def drive_names(self) -> dict[int, str]:
         """Displayed drive names by node id, in cable order: ``cable 1 (drive 11)``.

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import join
 
 import numpy as np
 
@@ -102,6 +103,23 @@ def rig_on_bus(
 ) -> Rig:
     """The rig of a file, on another bus if one is given, with calibration results."""
     return calibrated_rig(load_rig(path).with_bus(interface, channel), calibration)
+
+
+def words_of(**options: object) -> tuple[str, ...]:
+    """Options as typed in another command: one for each value of a list, none for None."""
+    lists = {key: value if isinstance(value, list) else [value] for key, value in options.items()}
+    pairs = [(f"--{key}", str(one)) for key, values in lists.items() for one in values if one]
+    return tuple(word for pair in pairs for word in pair)
+
+
+def run_command(plan: Path, rig_file: Path, rig: Rig, calibration: list[Path] | None) -> str:
+    """`cdpr run` of a plan, on the rig that it was made for."""
+    words = [str(plan), *words_of(rig=rig_file, calibration=calibration)]
+    if not rig.is_tracked:
+        words.append("--no-camera")
+    elif rig.document.bus.interface != "virtual":  # there images are rendered
+        words += words_of(camera="SOURCE")
+    return f"cdpr run {join(words)} -o RUNDIR"
 
 
 def require_unused(verb: str, options: Mapping[str, object], why: str) -> None:

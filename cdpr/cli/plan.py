@@ -19,6 +19,7 @@ from cdpr.cli.options import (
     SCENE,
     Triple,
     calibrated_rig,
+    run_command,
 )
 from cdpr.cli.output import Terminal, present
 from executor.recording.resume import passing, scene_after
@@ -143,11 +144,8 @@ def plan(
     listener.remarks(the_scene.remarks(the_rig))
     document = plan_path(the_rig, the_scene, settings, listener, rounds=of_legs, done=done)
     save_plan(document, output)
-    more = "".join(f" --calibration {quote(str(file))}" for file in calibration or [])
-    more += "" if the_rig.cameras and the_rig.platform_tags else " --no-camera"
-    file = quote(str(output))
-    run_it = f"cdpr run {file} --rig {quote(str(rig))}{more} -o RUNDIR"
-    next_step = f"cdpr check {file}, then {run_it}"
+    run_it = run_command(output, rig, the_rig, calibration)
+    next_step = f"cdpr check {quote(str(output))}, then {run_it}"
     facts = [*begun, *plan_facts(document), *_least_rounds(document), ("next", next_step)]
     present(as_json, {"plan": str(output), **plan_as_dict(document)}, f"plan {output}", facts)
 

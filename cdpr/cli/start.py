@@ -123,7 +123,8 @@ def new(
     show_line(f"wrote {output}: {answers['cables']} cables")
     rig = load_rig(output)
     Terminal().remarks(rig.document.remarks(), _home_remarks(rig))
-    show_line(f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE")
+    plan = f"cdpr plan {name} SCENE -o plan.json"
+    show_line(f"next: review it, then cdpr doctor {name}, and with a scene {plan}")
 
 
 def _home_remarks(rig: Rig) -> list[str]:

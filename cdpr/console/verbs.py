@@ -67,7 +67,7 @@ class ConsoleFiles:
     def run_arguments(self, plan: str, plan_hash: str) -> list[str]:
         """Of `cdpr run` for a plan file, if it has this hash."""
         cameras = [text for source in self.cameras for text in ("--camera", source)]
-        if not (cameras or is_simulated(self.rig)):
+        if not (cameras or (is_simulated(self.rig) and self.rig.is_tracked)):
             cameras = ["--no-camera"]
         return [plan, "--rig", str(self.rig_file), "--plan-hash", plan_hash, *cameras]
 

@@ -32,7 +32,7 @@ def choose_camera(rig: Rig, wanted: str | None, without: bool, in_process: bool)
                 "--camera and --no-camera contradict each other", next_step="leave out one of them"
             )
         return None
-    if not rig.cameras or not rig.platform_tags:
+    if not rig.is_tracked:
         raise BadInput(
             "the rig file has no camera or no tags",
             where=rig.name,

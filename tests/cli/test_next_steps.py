@@ -13,11 +13,15 @@ from typing import Any
 
 import pytest
 
+from calibration.geometry.pose_selection import MeasurementPlan
 from calibration.results import write_result
 from cdpr.cli.operate.run import show
+from cdpr.cli.options import run_command
 from cdpr.cli.output import progress_bar
+from drivers.plausibility import HOMING_OPTIONS
 from executor import service
-from executor.drives import DriveStatus
+from executor.cameras.sources import choose_cameras
+from executor.drives import DriveStatus, is_simulated
 from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import BEGUN, RunFolder
@@ -28,12 +32,12 @@ from executor.run_result import RunResult
 from executor.service import StatusResult
 from executor.supervision import Supervisor
 from model.errors import BadInput, Fault
-from model.rig import load_rig
+from model.rig import Rig, load_rig, rig_from_document
 from model.scene import load_scene
 from planner.planning import plan_path
 from planner.settings import OptimalSettings, PlannerSettings
 from tests.calibration.results import camera_result_of
-from tests.cli.plans import CONFIGS, RIG
+from tests.cli.plans import CONFIGS, GOAL_MM, RIG, START_MM, free_scene, straight_plan
 from tests.cli.program import call, one_message
 
 SCENE = CONFIGS / "environment_1.yaml"
@@ -68,14 +72,88 @@ def test_the_next_step_after_a_plan_of_a_new_rig_runs(
 ) -> None:
     """Its file has no camera and no tags yet."""
     monkeypatch.chdir(tmp_path)
-    assert call("new", "rig.yaml", answers="\n" * 50).code == 0
-    goal = ("--goal-mm", "170", "180", "300")
-    answer = call("plan", "rig.yaml", SCENE, "-o", "plan.json", *goal)
+    made = call("new", "rig.yaml", answers="\n" * 50)
+    assert made.code == 0, made
+    *_, plan = commands_in(made.out.splitlines()[-1])
+    words = [str(SCENE) if word == "SCENE" else word for word in plan]
+    answer = call(*words, "--goal-mm", "170", "180", "300")
     assert answer.code == 0, answer
     (line,) = (line for line in answer.out.splitlines() if line.split()[:1] == ["next"])
     assert "--no-camera" in line
     for words in commands_in(line):
         assert call(*words, *(("--fast",) if words[0] == "run" else ())).code == 0
+
+
+def test_the_next_step_after_homing_is_a_jog_with_the_same_bus_and_calibration(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was refused without a scene, and moved the drives of the rig file, which may be others."""
+    monkeypatch.chdir(tmp_path)
+    result = write_result(tmp_path, camera_result_of())
+    same = ("--interface", "virtual", "--channel", "my bus", "--calibration", str(result))
+    homed = call("home", RIG, "--at-home", "--fast", *same)
+    assert homed.code == 0, homed
+    _, jog, *parts = homed.out.splitlines()[-1].split("`")
+    (words,) = commands_in(jog)
+    assert words == ["jog", str(RIG), *same, "--to-home", "--scene", "SCENE"]
+    assert "--no-scene" in parts
+    jogged = call(*words[:-1], SCENE, "--fast")
+    assert jogged.code == 0, jogged
+
+
+WITHOUT = load_rig(RIG).document.model_copy(update={"cameras": [], "tags": None})
+
+
+@pytest.mark.parametrize(
+    ("rig", "interface", "options"),
+    [
+        (load_rig(RIG), "virtual", ()),
+        (load_rig(RIG), "socketcan", ("--camera", "SOURCE")),
+        (rig_from_document(WITHOUT), "virtual", ("--no-camera",)),
+        (rig_from_document(WITHOUT), "socketcan", ("--no-camera",)),
+    ],
+)
+def test_a_run_as_the_next_step_names_the_cameras_that_it_needs(
+    rig: Rig, interface: str, options: tuple[str, ...]
+) -> None:
+    on_bus = rig.with_bus(interface, "can0")
+    line = run_command(Path("my plan.json"), Path("rig.yaml"), on_bus, [Path("a"), Path("b")])
+    ((verb, *words),) = commands_in(line)
+    files = ["my plan.json", "--rig", "rig.yaml", "--calibration", "a", "--calibration", "b"]
+    assert (verb, words) == ("run", [*files, *options, "-o", "RUNDIR"])
+    cameras = ["0" for word in words if word == "SOURCE"]
+    choose_cameras(on_bus, cameras, "--no-camera" in words, is_simulated(on_bus))
+
+
+def test_the_next_steps_after_the_choice_of_poses_fit_a_rig_without_a_camera(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They left out `--calibration`, without which `cdpr run` refuses the plan, and the camera."""
+    monkeypatch.chdir(tmp_path)
+    rig = rig_from_document(WITHOUT)
+    document = straight_plan(rig, free_scene(START_MM, GOAL_MM), [START_MM, GOAL_MM])
+    made = MeasurementPlan((rig.home,), document)
+    monkeypatch.setattr("cdpr.cli.calibrate.rig.calibrated_rig", lambda *_: rig)
+    monkeypatch.setattr("cdpr.cli.calibrate.rig.measurement_poses", lambda *_, **_options: made)
+    Path("result.yaml").touch()
+    options = ("-o", "measure.json", "--calibration", "result.yaml")
+    answer = call("calibrate", "poses", RIG, SCENE, *options)
+    assert answer.code == 0, answer
+    run, calibrate = commands_in(answer.out.splitlines()[-1])
+    assert run[run.index("--calibration") + 1] == "result.yaml"
+    assert "--no-camera" in run
+    assert calibrate == ["calibrate", "rig", str(RIG), "RUNDIR", "--without-poses"]
+
+
+def test_the_next_step_after_calibration_results_were_applied_states_the_pose(
+    tmp_path: Path,
+) -> None:
+    result = write_result(tmp_path, camera_result_of())
+    applied = call("calibrate", "apply", RIG, result, "-o", tmp_path / "new.yaml")
+    assert applied.code == 0, applied
+    _, home, then = applied.out.splitlines()[-1].split("`")
+    one_message(call(*commands_in(home)[0], "--fast"), 2, "state the platform pose")
+    assert HOMING_OPTIONS in then
 
 
 def test_a_plan_that_was_made_for_calibrated_numbers_is_refused_with_that_as_a_reason(

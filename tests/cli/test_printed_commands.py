@@ -48,7 +48,7 @@ STEPS = (
     (0, "jog --help"),
     (0, "plan --help"),
     (0, "jog configs/gachon_8_6.yaml --by-mm 0 0 10 --scene SCENE --fast"),
-    (0, "jog configs/gachon_8_6.yaml --to-home --no-scene --fast"),
+    (0, "jog configs/gachon_8_6.yaml --to-home --scene SCENE --fast"),
     (1, "jog configs/gachon_8_6.yaml --cable 3 --mm -5 --fast"),  # it is taut, and says so
     (0, "track configs/gachon_8_6.yaml synthetic --plan plan.json -o poses.csv --pictures 3"),
     (0, "track REHEARSAL examples/rig_session/pictures -o seen.csv"),

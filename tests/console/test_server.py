@@ -55,6 +55,8 @@ from cdpr.console.verbs import (
 from cdpr.console.view import preview
 from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
+from executor.cameras.sources import SYNTHETIC, choose_cameras
+from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import preparations, stop_runs
 from executor.remote.command_server import commands_from_start
@@ -67,7 +69,7 @@ from executor.supervision import LocalRequests, Supervisor
 from model.errors import BadInput, Refused
 from model.plan import Plan, load_plan, save_plan
 from model.pose import Pose
-from model.rig import Rig, load_rig
+from model.rig import Rig, load_rig, rig_from_document
 from model.scene import load_scene
 from tests.cli.plans import GOAL_MM, RIG, START_MM, free_scene, straight_plan, write_short_plan
 from tests.cli.program import call
@@ -876,6 +878,21 @@ def test_a_run_that_waits_for_its_drives_begins_only_if_it_is_still_wanted(
         assert "before this command began" in why_not
         assert served.started == []
     console.close()
+
+
+@pytest.mark.parametrize("bus", ["virtual", "socketcan"])
+@pytest.mark.parametrize("lacks", [{}, {"cameras": []}, {"tags": None}])
+def test_a_run_without_a_camera_to_use_is_started_without_one(
+    bus: str, lacks: dict[str, Any]
+) -> None:
+    """`cdpr run` refused every plan of a rig from `cdpr new`, and no button adds the option."""
+    rig = rig_from_document(load_rig(RIG).document.model_copy(update=lacks)).with_bus(bus, "can0")
+    files = ConsoleFiles(RIG, rig, (), (), (), None, True, False)
+    renders = bus == "virtual" and not lacks
+    without = "--no-camera" in files.run_arguments("plan.json", "a hash")
+    assert without != renders
+    cameras = choose_cameras(rig, [], without, is_simulated(rig))
+    assert cameras == (dict.fromkeys(rig.cameras, SYNTHETIC) if renders else {})
 
 
 @pytest.mark.parametrize("change", ["edit", "remove", "calibrate", "touch"])

@@ -16,6 +16,7 @@ from calibration.results import Calibration, Destination
 from cdpr.cli.arguments import argument, flag, option, required
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, present, show_facts, show_json
+from drivers.plausibility import HOMING_OPTIONS
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
@@ -110,7 +111,7 @@ def apply(
     facts = [(f"{one.kind} {one.name}", f"{one.date}: {one.verdict}") for one in loaded]
     facts += [
         ("rig file", str(output)),
-        ("next", f"`cdpr home {quote(str(output))}`, then plan with it"),
+        ("next", f"`cdpr home {quote(str(output))}` with {HOMING_OPTIONS}, then plan with it"),
     ]
     document = {"rig": str(output), "results": [str(path) for path in results]}
     present(as_json, document, f"{new.name} with its calibration", facts)

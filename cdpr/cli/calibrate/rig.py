@@ -23,6 +23,7 @@ from cdpr.cli.options import (
     SCENE,
     Triple,
     calibrated_rig,
+    run_command,
 )
 from cdpr.cli.output import Terminal, present
 from model.files.output import require_new_file
@@ -77,8 +78,9 @@ def poses(
     angles = [degrees(pose.angle_to(the_rig.home)) for pose in made.poses]
     sentences = [s for s in plan_facts(made.document) if s[0] not in ("via", "search")]
     text = f"{len(made.poses)}, rotated by up to {max(angles):.1f}°"
-    plan, file = quote(str(output)), quote(str(rig))
-    next_step = f"cdpr run {plan} --rig {file} -o RUNDIR, then cdpr calibrate rig {file} RUNDIR"
+    run_it = run_command(output, rig, the_rig, calibration)
+    then = f"cdpr calibrate rig {quote(str(rig))} RUNDIR"
+    next_step = f"{run_it}, then {then}{'' if the_rig.is_tracked else ' --without-poses'}"
     document = {"plan": str(output), "turned_deg": angles, **plan_as_dict(made.document)}
     facts = [("poses", text), *sentences, ("next", next_step)]
     present(as_json, document, f"plan {output}", facts)

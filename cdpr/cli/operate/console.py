@@ -13,7 +13,7 @@ from cdpr import console as page  # loads the server where it is asked for
 from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.run import supervise
 from cdpr.cli.operate.supervision import handling
-from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions
+from cdpr.cli.options import RIG, WITHOUT_REAL_TIME, BusOptions, words_of
 from cdpr.cli.output import Terminal, show_facts, show_line
 from cdpr.console.session import Console
 from cdpr.console.verbs import ConsoleFiles
@@ -68,14 +68,11 @@ def console(
             why="the connection is not encrypted, and anyone with the address can move the robot",
             next_step="use an SSH tunnel, or pass --allow-others on a network that you trust",
         )
-    options = [("--interface", bus.interface), ("--channel", bus.channel)]
     files = ConsoleFiles(
         rig_file=rig,
         rig=bus.rig(rig),
-        bus_options=tuple(text for name, value in options if value for text in (name, value)),
-        calibration_options=tuple(
-            text for path in bus.calibration or () for text in ("--calibration", str(path))
-        ),
+        bus_options=words_of(interface=bus.interface, channel=bus.channel),
+        calibration_options=words_of(calibration=bus.calibration),
         cameras=tuple(camera or ()),
         scene_file=scene,
         without_real_time=without_real_time,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from shlex import quote
+from shlex import join
 
 from cdpr.cli.arguments import flag, given_options, option
 from cdpr.cli.operate.run import MotionOptions
@@ -17,6 +17,7 @@ from cdpr.cli.options import (
     level_pose,
     require_unused,
     rig_on_bus,
+    words_of,
 )
 from cdpr.cli.output import out, show_facts, show_json, show_line
 from executor import homing
@@ -109,5 +110,8 @@ def home(
         show_json({"file": file, **result.reference.model_dump(mode="json")})
     else:
         show_facts("drives homed; they hold", result.facts())
-        jog = f"cdpr jog {quote(str(rig))}"
-        show_line(f"next: `{jog} --to-home` or `--by-mm X Y Z`, then `cdpr plan` and `cdpr run`")
+        same = words_of(interface=interface, channel=channel, calibration=calibration)
+        show_line(
+            f"next: `cdpr jog {join([str(rig), *same])} --to-home --scene SCENE` (`--no-scene`"
+            " without obstacles, `--by-mm X Y Z` by a distance), then `cdpr plan` and `cdpr run`"
+        )
