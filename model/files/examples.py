@@ -263,5 +263,10 @@ bus:
   bitrate: {bitrate}
   cycle_ms: 10
 
+# Without this section the drives are CANopen drives that need no profile ({pages}/drives.md):
+# drives:
+#   type: cia402  # or odrive, with other keys: {pages}/odrive.md
+#   profile: epos4  # or nanotec-c5e, akd, elmo-gold, or the path of your own
+
 # Tags on the platform and cameras, to measure its pose: {pages}/rig-file.md.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import fields
 from itertools import product
 from pathlib import Path
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cdpr.cli.start import RigOptions
+from drivers.cia402.profile import profile_names
 from model.files.examples import rig_text
 from model.files.new_rig import (
     AFTER_COORDINATES,
@@ -19,6 +21,7 @@ from model.files.new_rig import (
     CSV_COLUMNS,
     collect_answers,
 )
+from model.files.rig_file import Cia402Document, RigDocument
 from model.files.validation import parse_yaml
 from model.rig import load_rig
 from tests.cli.plans import CONFIGS
@@ -58,6 +61,20 @@ def test_enter_for_every_question_makes_a_rig_that_can_be_planned_and_looked_at(
     scene = CONFIGS / "environment_1.yaml"
     planned = call("plan", rig, scene, "-o", tmp_path / "plan.json")
     assert planned.code == 0, planned
+
+
+def test_a_new_file_shows_how_the_make_of_the_drives_is_named() -> None:
+    """A laboratory with EPOS4 got a file for drives that need no profile, without a word of it."""
+    text = rig_text(collect_answers("rig", {}))
+    _, _, after = text.partition("# drives:\n")
+    lines = after.split("\n\n")[0].replace("#", " ", 1).replace("\n#", "\n ")
+    drives = parse_yaml(f"drives:\n{lines}\n").data["drives"]
+    document = RigDocument.model_validate({**parse_yaml(text).data, "drives": drives})
+    assert document.drives == Cia402Document(type="cia402", profile="epos4")
+    assert all(name in lines for name in profile_names())
+    pages = set(re.findall(r"[^ (]+\.md", text))
+    assert {Path(page).name for page in pages} == {"drives.md", "odrive.md", "rig-file.md"}
+    assert all(Path(page).is_absolute() and Path(page).is_file() for page in pages)
 
 
 def test_each_question_shows_its_default_and_its_unit(tmp_path: Path) -> None:

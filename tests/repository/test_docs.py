@@ -23,10 +23,12 @@ from executor.control.winch_laws import MOST_RESERVE, RESERVE, RESERVE_COUNTS, C
 from executor.jogging import LONGEST_MM, SPEED
 from executor.winch_runs import limit_of
 from model.errors import BadInput, Fault, HardwareMissing, Refused
-from model.files.new_rig import AFTER_COORDINATES, BEFORE_COORDINATES
+from model.files.examples import rig_text
+from model.files.new_rig import AFTER_COORDINATES, BEFORE_COORDINATES, collect_answers
 from model.files.plan_file import PlanDocument
 from model.files.rig_file import CableDocument, PlatformDocument, RigDocument, WinchDocument
 from model.files.scene_file import SceneDocument
+from model.files.validation import parse_yaml
 from model.rig import load_rig, rig_from_document
 from model.statics.gravity import STANDARD_GRAVITY
 from planner.anytime import path as anytime_path
@@ -234,14 +236,16 @@ def test_the_page_on_python_lists_the_verbs_that_have_a_function() -> None:
 
 
 def test_the_page_on_a_new_rig_lists_what_no_question_asks_for() -> None:
-    page = (ROOT / "docs" / "your-own-rig.md").read_text("utf-8")
+    page = " ".join((ROOT / "docs" / "your-own-rig.md").read_text("utf-8").split())
     listed = page.split("It does not ask for")[1].partition(" of each winch")[0]
     asked = {question.key for question in (*BEFORE_COORDINATES, *AFTER_COORDINATES)}
     asked |= {"size_mm", "home", "drum_mm_per_rev"}  # by other names
-    measured_later = {"home_counts", "cable_stiffness_n"}
-    parts: tuple[type[BaseModel], ...] = (PlatformDocument, CableDocument, WinchDocument)
-    of_a_rig = {"pulleys"}.union(*(part.model_fields for part in parts))
-    assert set(re.findall(r"`(\w+)`", listed)) == of_a_rig - asked - measured_later
+    asked |= set(parse_yaml(rig_text(collect_answers("rig", {}))).data)
+    measured_later = {"home_counts", "cable_stiffness_n", "outlets_error_mm", "anchors_error_mm"}
+    of_no_robot = {"description", "simulation"}
+    parts = (RigDocument, PlatformDocument, CableDocument, WinchDocument)
+    of_a_rig = set().union(*(part.model_fields for part in parts))
+    assert set(re.findall(r"`(\w+)`", listed)) == of_a_rig - asked - measured_later - of_no_robot
 
 
 def test_commissioning_writes_no_file_twice() -> None:
