@@ -62,7 +62,7 @@ def ready_folder(name: str = "configs") -> Path:
 
 
 def docs_page(name: str) -> str:
-    """Path of a page of the documentation, for messages: a wheel comes without a clone."""
+    """Path of a page of the documentation, for messages: a user of the wheel has no clone."""
     return str(ready_folder("docs") / name)
 
 
