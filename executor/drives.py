@@ -79,13 +79,17 @@ def require_other_process(rig: Rig) -> None:
     require_unaltered(rig)
 
 
-def require_own_time(rig: Rig, realtime: bool) -> None:
-    """Requires real time for drives that are not simulated in this process.
+def require_drives(rig: Rig, realtime: bool) -> None:
+    """Requires drives that can be simulated in this process, or real time for those on a bus.
 
     Raises:
-        BadInput: Simulated time was requested for them.
+        BadInput: They cannot, as with a drive profile of one's own; or no real time.
     """
-    if not (realtime or is_simulated(rig)):
+    if is_simulated(rig):
+        from simulation.factory import check_drives  # a real bus loads no simulator
+
+        check_drives(rig)
+    elif not realtime:
         raise BadInput(
             "`realtime=False` needs drives simulated in this process",
             why="time on a real bus cannot run faster",
@@ -196,9 +200,8 @@ def abandoned_drives_fault(document: RigDocument, released: Collection[int]) -> 
     except CdprError as error:
         return f"state of the drives unknown: {error.what}"
     words = snapshot.status_words.tolist()
-    rows = zip(
-        rig.drive_names.items(), drive_states(rig, words), stop_alone(rig, words), strict=True
-    )
+    states, alone = drive_states(rig, words), stop_alone(rig, words)
+    rows = zip(rig.drive_names.items(), states, alone, strict=True)
     wrong = [
         f"{name} is in {state}"
         for (node, name), state, good in rows
@@ -280,8 +283,7 @@ def drives_of(
 ) -> AbstractContextManager[ReadyDrives]:
     """`open_drives` with picklable arguments, for another process.
 
-    Remarks are in `ReadyDrives.remarks`, for the listener of the requesting process; the listener
-    given here is for a call in this process.
+    Remarks are in `ReadyDrives.remarks` for the other process; the listener is for a call in this.
     """
     return open_drives(rig_from_document(document), simulated_start, load, listener=listener)
 

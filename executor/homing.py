@@ -18,7 +18,7 @@ from executor.cameras.sources import choose_one_camera, require_synthetic_images
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
 from executor.control.winch_loop import MakeLaw
 from executor.control.winch_motion import WinchResult
-from executor.drives import is_simulated, require_own_time
+from executor.drives import is_simulated, require_drives
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import Facts, Proposal, forget_proposal, homing_proposal, require_confirmed
@@ -144,7 +144,7 @@ def home(
     at_home, realtime = truth_value("at_home", at_home), truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     in_process = is_simulated(rig)
-    require_own_time(rig, realtime)
+    require_drives(rig, realtime)
     if isinstance(camera, str | int | np.integer):
         camera = [str(camera)]
     sources = [str(source) for source in sequence_of("camera", () if camera is None else camera)]

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from executor.control.preconditions import require_still_referenced
 from executor.control.winch_laws import CableStep
-from executor.drives import current_pose, is_simulated, read_snapshot, require_own_time
+from executor.drives import current_pose, is_simulated, read_snapshot, require_drives
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import Facts, Proposal, cable_proposal, require_confirmed
 from executor.recording.run_folder import RunEvent
@@ -99,7 +99,7 @@ def jog(
     with commands_from_start("jog", rig, supervisor, realtime=realtime) as commands:
         slow = with_speed(rig, speed)
         by = None if by is None else point_of("by", by)
-        require_own_time(slow, realtime)
+        require_drives(slow, realtime)
         require_distance(by, to_home=to_home)
         around = empty_scene(slow) if scene is None else scene.changed(stops=())
         make_folder = folder_maker(folder, "jog")
@@ -326,7 +326,7 @@ def jog_cable(
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     cable, length = whole_number("cable", cable), real_number("length", length, "m")
     slow = with_speed(rig, speed)
-    require_own_time(slow, realtime)
+    require_drives(slow, realtime)
     _require_cable(slow, cable, length)
     winch = slow.winches[cable - 1]
     limit = limit_of(slow, limit)

@@ -28,7 +28,7 @@ from executor.drives import (
     drives_of,
     is_simulated,
     open_drives,
-    require_own_time,
+    require_drives,
     require_simulated_start,
 )
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
@@ -148,7 +148,7 @@ def run(
         require_same_rig(plan, rig, plan_file)
         chosen = resolve_cameras(rig, cameras, is_simulated(rig))
         require_synthetic_images(chosen.values(), not realtime)
-        require_own_time(rig, realtime)
+        require_drives(rig, realtime)
         if plan.scene.obstacles:
             is_sealed = rig.document.cameras == plan.rig.document.cameras
             require_stated_errors(rig, list(chosen), then=_PASS_THE_RIG if is_sealed else "")

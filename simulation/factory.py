@@ -52,7 +52,7 @@ def make_rehearsal(
     return SimulatedCia402Rig(rig, bus, start_pose, load, behaviour=behaviour, eds=eds)
 
 
-def check_drives(rig: Rig, behaviour: DriveBehaviour, eds: Path | None) -> None:
+def check_drives(rig: Rig, behaviour: DriveBehaviour = STRICT, eds: Path | None = None) -> None:
     """Checks the arguments of `make_rehearsal`; errors as there."""
     if rig.document.drives.type != "odrive":
         eds_of(rig, eds)

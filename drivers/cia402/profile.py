@@ -21,6 +21,7 @@ from model.files.drive_profile_file import (
     object_key,
     object_name,
 )
+from model.files.reading import unreadable
 from model.files.rig_file import Cia402Document
 from model.rig import Rig
 
@@ -56,8 +57,10 @@ def load_profile(name: str) -> ProfileDocument:
         )
     try:
         status = path.stat()
-    except (OSError, ValueError):
-        return load_yaml(path, ProfileDocument)  # refuses it with the reason
+    except (OSError, ValueError) as error:
+        refused = unreadable(path, error)
+        refused.next_step += "; drives.profile is relative to the current folder"
+        raise refused from None
     return _loaded(path.resolve(), (status.st_ino, status.st_mtime_ns, status.st_size))
 
 

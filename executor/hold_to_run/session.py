@@ -18,7 +18,7 @@ from executor.control.winch_motion import WinchResult
 from executor.drives import (
     drives_of,
     is_simulated,
-    require_own_time,
+    require_drives,
     require_simulated_start,
     unreferenced_drives_of,
 )
@@ -89,7 +89,7 @@ def jog_session(
     realtime = truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     slow = with_speed(rig, speed)
-    require_own_time(slow, realtime)
+    require_drives(slow, realtime)
     require_simulated_start(slow, start)
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         interlock = MotionInterlock(slow)
@@ -149,7 +149,7 @@ def cable_session(
     realtime = truth_value("realtime", realtime)
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     slow = with_speed(rig, speed)
-    require_own_time(slow, realtime)
+    require_drives(slow, realtime)
     limit = limit_of(slow, limit)
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()

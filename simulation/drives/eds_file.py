@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+from drivers.cia402.profile import profile_of
 from model.errors import BadInput
 from model.files.reading import MEGABYTE, read_bytes
 from model.rig import Rig
@@ -111,8 +112,9 @@ def profile_path(profile: str) -> Path:
         raise BadInput(
             f"the simulation has no EDS file for the drive profile {profile!r}",
             where="drives.profile",
-            why=f"known profiles: {known}",
-            next_step="choose one of them, or pass the manufacturer's file with --eds",
+            why=f"it has one for each of {known}",
+            next_step="rehearse on a copy of the rig file without drives.profile; or on the drives"
+            " of `cdpr sim RIG --eds FILE`, over udp_multicast, with the manufacturer's file",
         )
     return path
 
@@ -121,9 +123,12 @@ def eds_of(rig: Rig, path: Path | None = None) -> Eds:
     """The objects of a rig's simulated drives, from a file or for its drive profile.
 
     Raises:
-        BadInput: There is no such file, or it cannot be used.
+        BadInput: There is no such file or profile, or it cannot be used.
     """
-    return read_eds(path or profile_path(getattr(rig.document.drives, "profile", "cia402")))
+    if path is None:
+        profile_of(rig)  # a profile that is missing or invalid is reported as such
+        path = profile_path(getattr(rig.document.drives, "profile", "cia402"))
+    return read_eds(path)
 
 
 @cache

@@ -57,6 +57,37 @@ def test_what_is_not_clearly_meant_moves_nothing(
     assert not list(tmp_path.rglob("*.json"))
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("home", "--at-home"),
+        ("jog", "--cable", "1", "--mm", "1"),
+        ("jog", "--by-mm", "0", "0", "1", "--no-scene"),
+    ],
+)
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("name: Ours\nsources: [our bench]\n", ("no EDS file for", "cdpr sim RIG --eds FILE")),
+        ("name: Ours\nsources: [our bench]\nmonitoring: pigeon\n", ("lab.yaml:3", "heartbeat")),
+        (None, ("lab.yaml: no such file", "relative to the current folder")),
+    ],
+)
+def test_drives_that_cannot_be_simulated_are_refused_before_the_proposal(
+    tmp_path: Path, words: tuple[str, ...], text: str | None, parts: tuple[str, ...]
+) -> None:
+    """The cure was an option that only `cdpr sim` has, for a missing profile as well."""
+    profile, rig = tmp_path / "lab.yaml", tmp_path / "rig.yaml"
+    rig.write_text(f"{RIG.read_text()}drives: {{type: cia402, profile: {profile}}}\n")
+    if text is not None:
+        profile.write_text(text)
+    verb, *options = words
+    answer = call(verb, rig, *options, "--fast")
+    assert answer.code == 2, answer
+    assert "ready to" not in answer.said
+    assert all(part in answer.said for part in parts), answer.said
+
+
 def test_a_no_moves_nothing(tmp_path: Path) -> None:
     bus = ("--interface", "udp_multicast", "--channel", "239.74.163.25:41990")
     assert call("home", RIG, "--at-home", *bus, answers="n\n").code == 130
