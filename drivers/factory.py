@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import can
@@ -160,6 +161,30 @@ def cycles_until_reported(rig: Rig) -> int:
     ODrives have no SYNC: they apply it on arrival, and report their position later in the cycle.
     """
     return 0 if rig.document.drives.type == "odrive" else 1
+
+
+def check_drive_files(rig: Rig) -> str:
+    """What the drives of a rig are, after a check of the files that they need.
+
+    Raises:
+        BadInput: A file or package is missing, or a file is invalid or does not fit the rig.
+    """
+    drives = rig.document.drives
+    if drives.type == "cia402":
+        from drivers.cia402.profile import profile_of
+
+        profile_of(rig)
+        return f"CANopen, profile {drives.profile}"
+    from drivers.odrive.configure import check_rig
+    from drivers.odrive.endpoints import read_endpoints
+    from drivers.odrive.messages import read_layouts
+
+    layouts = read_layouts(drives.dbc)
+    check_rig(rig, drives, layouts)
+    if drives.endpoints is None:
+        return "ODrives; their settings are not read back: the rig file has no drives.endpoints"
+    read_endpoints(Path(drives.endpoints), drives, layouts)
+    return "ODrives; their settings are read back"
 
 
 def read_drives(

@@ -21,10 +21,15 @@ from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from executor.cameras.sources import parse_camera_sources
 from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, PRIORITY, has_capability
-from model.errors import BadInput, CdprError, without_passwords
-from model.files.rig_file import OdriveDocument
-from model.rig import Rig
+from model.errors import BadInput, CdprError, InvalidFile, distinct_figures, without_passwords
+from model.kinematics import NoCable
+from model.rig import Camera, Rig
+from model.scene import empty_scene
+from model.statics.gravity import working_tensions
+from model.statics.tension_distribution import TensionInfeasible
+from planner.settings import CLEARANCE_RESERVE
 
 if TYPE_CHECKING:
     from drivers.can_bus import BusSettings, KernelInterface
@@ -90,15 +95,20 @@ def check_machine() -> list[MachineCheck]:
     return [python_version(), *own_packages(), *libraries(), *machine()]
 
 
-def check_rig(rig: Rig, camera: str | None = None) -> list[MachineCheck]:
-    """Checks the rig's tag detector, drive files, bus and first camera.
+def check_rig(rig: Rig, camera: str | Sequence[str] | None = None) -> list[MachineCheck]:
+    """Checks the rig's tag detector, drive files, bus and cameras.
 
     Args:
         rig: The robot.
-        camera: Index, device or address of a camera to open; None to open none.
+        camera: Index, device or address of its first camera, ``NAME=SOURCE`` of another, or one of
+            these for each of several cameras; None to open none.
+
+    Raises:
+        BadInput: A source names no camera of the rig file.
     """
+    sources = [camera] if isinstance(camera, str) else camera or []
     detector = libraries({"pyapriltags": "pyapriltags"} if rig.tag_detector == "apriltag" else {})
-    return [*detector, *rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, camera)]
+    return [*detector, *rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, sources)]
 
 
 def python_version() -> MachineCheck:
@@ -152,24 +162,15 @@ def machine() -> list[MachineCheck]:
 
 def rig_drives(rig: Rig) -> list[MachineCheck]:
     """Whether the files that the drives of a rig need exist and are valid."""
-    drives = rig.document.drives
-    if not isinstance(drives, OdriveDocument):
-        return []
-    from drivers.odrive.configure import check_rig
-    from drivers.odrive.endpoints import read_endpoints
-    from drivers.odrive.messages import read_layouts
+    from drivers.factory import check_drive_files  # needs python-can
 
     try:
-        layouts = read_layouts(drives.dbc)
-        check_rig(rig, drives, layouts)
-        if drives.endpoints is not None:
-            read_endpoints(Path(drives.endpoints), drives, layouts)
+        return [MachineCheck("drives", True, check_drive_files(rig))]
     except BadInput as error:
-        return [MachineCheck("drives", False, f"{error.where}: {error.what}", error.next_step)]
-    known = (
-        "read back" if drives.endpoints else "not read back: the rig file has no drives.endpoints"
-    )
-    return [MachineCheck("drives", True, f"ODrives; their settings are {known}")]
+        text = f"{error.where}: {error.what}"
+        if isinstance(error, InvalidFile):
+            text = "; ".join(str(error).splitlines()[:-1])  # the last one is the next step
+        return [MachineCheck("drives", False, text, error.next_step)]
 
 
 def rig_bus(rig: Rig) -> list[MachineCheck]:
@@ -208,28 +209,68 @@ def rig_bus(rig: Rig) -> list[MachineCheck]:
     return checks
 
 
-def rig_cameras(rig: Rig, source: str | None) -> list[MachineCheck]:
-    """Whether a camera opens and its images have the size that the rig file states."""
+def rig_cameras(rig: Rig, sources: Sequence[str]) -> list[MachineCheck]:
+    """Whether cameras open and their images have the size that the rig file states.
+
+    Sources and errors as for `check_rig`; without a source no camera is opened.
+    """
     if not rig.cameras:
-        return [
-            MachineCheck("camera", source is None, "the rig file has none", "leave out --camera")
-        ]
-    camera, gamma = rig.cameras[0], ""
-    if "gamma" not in rig.document.cameras[0].model_fields_set:
-        gamma = "; its `gamma` is not stated: a webcam needs `gamma: srgb`"
-    if source is None:
-        devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*")))
-        text = f"not tested (--camera INDEX tests it); devices here: {devices or 'none'}{gamma}"
-        return [MachineCheck(f"camera {camera.name}", True, text)]
+        fix = "describe the camera under `cameras` of the rig file, with the size of its images"
+        return [MachineCheck("camera", not sources, "the rig file has none", fix)]
+    if sources:
+        chosen = parse_camera_sources(rig, list(sources), None, "`camera=`")
+        return [_camera(rig, camera, source) for camera, source in chosen.items()]
+    devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*"))) or "none"
+    checks = []
+    for camera in rig.cameras:
+        text = f"not tested (--camera {camera.name}=INDEX tests it); devices here: {devices}"
+        text += _unstated_gamma(rig, camera)
+        checks.append(MachineCheck(f"camera {camera.name}", True, text))
+    return checks
+
+
+def _camera(rig: Rig, camera: Camera, source: str) -> MachineCheck:
     from drivers.cameras.live import LiveCamera  # needs OpenCV
 
+    name = f"camera {camera.name}"
     try:
         LiveCamera(source, camera).close()
     except CdprError as error:
-        return [MachineCheck(f"camera {camera.name}", False, error.what, error.next_step)]
+        return MachineCheck(name, False, error.what, error.next_step)
     size = f"{camera.width} x {camera.height} px"
-    text = f"{without_passwords(source)} opens and delivers images of {size}{gamma}"
-    return [MachineCheck(f"camera {camera.name}", True, text)]
+    text = f"{without_passwords(source)} opens and delivers images of {size}"
+    return MachineCheck(name, True, text + _unstated_gamma(rig, camera))
+
+
+def _unstated_gamma(rig: Rig, camera: Camera) -> str:
+    [document] = (one for one in rig.document.cameras if one.name == camera.name)
+    stated = "gamma" in document.model_fields_set
+    return "" if stated else "; its `gamma` is not stated: a webcam needs `gamma: srgb`"
+
+
+def home_remarks(rig: Rig) -> list[str]:
+    """Why no motion can begin at the platform's home; empty if one can.
+
+    The cables cannot hold it, or are nearer to it or each other than a scene allows by default.
+    """
+    from model.clearance import ClearanceModel  # needs python-fcl
+
+    try:
+        working_tensions(rig, rig.home)
+    except (NoCable, TensionInfeasible) as error:
+        return [f"platform.home: {error.what}; {error.why}; {error.next_step}"]
+    scene = empty_scene(rig)
+    near = ClearanceModel(rig, scene).self_clearance(rig.home)
+    required = scene.self_clearance + CLEARANCE_RESERVE
+    if near.distance >= required:
+        return []
+    gap, least = distinct_figures((near.distance * 1e3, required * 1e3), 2)
+    apart = f"is {gap} mm from" if near.distance > 0.0 else "touches"
+    return [
+        f"platform.home: {near.first} {apart} {near.second}; a motion that begins there needs"
+        f" {least} mm, by the default of a scene's clearance.self_mm; if two outlets or anchors are"
+        " interchanged, correct them; otherwise move them or the home position"
+    ]
 
 
 # Kernel CAN bus: each check with the command that fixes it.

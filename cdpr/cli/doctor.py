@@ -14,7 +14,14 @@ from rich.table import Table
 from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import JSON
 from cdpr.cli.output import Terminal, err, out, show_json, show_line
-from executor.doctor import MachineCheck, check_machine, check_rig, examine, stopping_text
+from executor.doctor import (
+    MachineCheck,
+    check_machine,
+    check_rig,
+    examine,
+    home_remarks,
+    stopping_text,
+)
 from model.errors import BadInput
 from model.rig import Rig, load_rig
 
@@ -25,7 +32,11 @@ if TYPE_CHECKING:  # needs canopen, which may be missing
 def doctor(
     *,
     rig: Path | None = argument("also check this rig's bus and cameras", "[RIG]", default=None),
-    camera: str | None = option("also capture an image with this camera: index, device or address"),
+    camera: list[str] | None = option(
+        "also capture an image with this camera: index, device or address; NAME=SOURCE for a camera"
+        " other than the rig file's first; repeatable",
+        metavar="SOURCE",
+    ),
     drives: bool = flag("also read every object of every CANopen drive"),
     as_json: bool = JSON,
 ) -> None:
@@ -39,7 +50,7 @@ def doctor(
       cdpr doctor rig.yaml --camera 0
       cdpr doctor rig.yaml --drives
     """
-    if camera is not None and rig is None:
+    if camera and rig is None:
         raise BadInput(
             "checking a camera needs the rig file that describes it",
             where="--camera",
@@ -52,13 +63,15 @@ def doctor(
             next_step="pass the rig file as well: cdpr doctor RIG --drives",
         )
     checks = check_machine()
+    complete = all(check.good for check in checks)
     the_rig = None if rig is None else load_rig(rig)
     if the_rig is not None:
         checks += check_rig(the_rig, camera)
     if not as_json:
         _show_checks(checks)
     if the_rig is not None:
-        Terminal().remarks(the_rig.document.remarks())
+        at_home = home_remarks(the_rig) if complete else []  # needs a library
+        Terminal().remarks(the_rig.document.remarks(), at_home)
     objects = examine(the_rig) if the_rig is not None and drives else None
     if as_json:
         plain = [asdict(check) for check in checks]

@@ -10,6 +10,7 @@ from pathlib import Path
 from cdpr.cli.arguments import argument, flag, option
 from cdpr.cli.options import Triple
 from cdpr.cli.output import Terminal, out, show_json, show_line
+from executor.doctor import home_remarks
 from model.errors import BadInput
 from model.files.documents import write_atomic
 from model.files.examples import (
@@ -21,10 +22,7 @@ from model.files.examples import (
 )
 from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
 from model.files.output import require_new_file
-from model.kinematics import NoCable
-from model.rig import Rig, load_rig
-from model.statics.gravity import working_tensions
-from model.statics.tension_distribution import TensionInfeasible
+from model.rig import load_rig
 
 
 def examples(
@@ -122,17 +120,8 @@ def new(
     name = shlex.quote(str(output))
     show_line(f"wrote {output}: {answers['cables']} cables")
     rig = load_rig(output)
-    Terminal().remarks(rig.document.remarks(), _home_remarks(rig))
+    Terminal().remarks(rig.document.remarks(), home_remarks(rig))
     show_line(f"next: review it, then cdpr doctor {name}, and with a scene cdpr plan {name} SCENE")
-
-
-def _home_remarks(rig: Rig) -> list[str]:
-    """Why the cables cannot hold the platform at its home position; empty if they can."""
-    try:
-        working_tensions(rig, rig.home)
-    except (NoCable, TensionInfeasible) as error:
-        return [f"platform.home: {error.what}; {error.why}; {error.next_step}"]
-    return []
 
 
 def _ask(question: RigQuestion, default: str) -> str:

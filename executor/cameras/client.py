@@ -216,7 +216,7 @@ def wait_until_ready(processes: Sequence[CameraProcess], check_stop: Callable[[]
                 f"camera {names} did not open within {START_TIMEOUT:.0f} s",
                 where="cameras",
                 why="the device or its network does not answer",
-                next_step="check the camera with `cdpr doctor RIG --camera SOURCE`",
+                next_step="check the camera with `cdpr doctor RIG --camera NAME=SOURCE`",
             )
 
 

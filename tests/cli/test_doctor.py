@@ -255,6 +255,65 @@ def test_a_camera_that_is_not_there_is_missing_and_one_not_named_is_not_tried() 
     assert "not tested" in camera["text"]
 
 
+def with_two_cameras(tmp_path: Path) -> Path:
+    """A rig whose second camera, `side`, has larger images."""
+    document = load_rig(RIG).document
+    changes = {"name": "side", "width_px": 1920, "height_px": 1080}
+    side = document.cameras[0].model_copy(update=changes)
+    document = document.model_copy(update={"cameras": [*document.cameras, side]})
+    rig = tmp_path / "two.yaml"
+    rig.write_text(document.model_dump_json(exclude_unset=True))
+    return rig
+
+
+def test_each_camera_is_judged_by_its_own_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[int | str] = []
+
+    def capture(source: int | str) -> FakeCapture:
+        opened.append(source)
+        return FakeCapture()
+
+    monkeypatch.setattr(cameras, "_opened", capture)
+    rig = with_two_cameras(tmp_path)
+
+    def answers(*options: str) -> dict[str, tuple[bool, str]]:
+        checks = json.loads(call("doctor", rig, *options, "--json").out)
+        return {
+            one["name"]: (one["good"], one["text"])
+            for one in checks
+            if one["name"].startswith("camera")
+        }
+
+    (front,) = answers("--camera", "front=0").items()
+    assert (front[0], front[1][0]) == ("camera front", True)
+    (side,) = answers("--camera", "side=1").items()
+    assert (side[0], side[1][0]) == ("camera side", False)
+    assert "1920 x 1080" in side[1][1]
+    both = answers("--camera", "front=0", "--camera", "side=1")
+    assert {name: good for name, (good, _) in both.items()} == {
+        "camera front": True,
+        "camera side": False,
+    }
+    assert opened == [0, 1, 0, 1]
+    untested = answers()
+    assert "--camera side=INDEX tests it" in untested["camera side"][1]
+    unknown = call("doctor", rig, "--camera", "rear=0")
+    assert unknown.code == 2
+    assert "'rear'" in unknown.said
+
+
+def test_the_cure_for_a_rig_without_cameras_is_to_describe_them(tmp_path: Path) -> None:
+    document = load_rig(RIG).document.model_copy(update={"cameras": []})
+    rig = tmp_path / "blind.yaml"
+    rig.write_text(document.model_dump_json(exclude_unset=True))
+    assert call("doctor", rig).code == 0
+    answer = call("doctor", rig, "--camera", "0")
+    assert answer.code == 4
+    assert "the rig file has none next: describe the camera under `cameras`" in answer.said
+
+
 def test_a_camera_needs_the_rig_that_describes_it() -> None:
     answer = call("doctor", "--camera", "0")
     assert answer.code == 2
@@ -329,6 +388,27 @@ def test_drives_of_another_make_are_reported_with_what_to_change(
     assert objects["3001h:02"]["found"] == [{"drives": list(range(1, 9)), "value": "absent"}]
     shown = call("doctor", with_profile(tmp_path, "epos4"), "--drives").out
     assert "…" not in shown, "the keys that the user types are not cut"
+
+
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        (None, ("lab.yaml: no such file", "relative to the current folder")),
+        ("name: Ours\nsources: [x]\nmonitoring: pigeon\n", ("lab.yaml:3", "monitoring")),
+        ("name: Ours\nsources: [x]\n", ()),
+    ],
+)
+def test_a_profile_that_is_missing_or_invalid_is_found_without_reading_drives(
+    tmp_path: Path, text: str | None, parts: tuple[str, ...]
+) -> None:
+    profile = tmp_path / "lab.yaml"
+    if text is not None:
+        profile.write_text(text)
+    answer = call("doctor", with_profile(tmp_path, str(profile)))
+    assert answer.code == (4 if parts else 0), answer
+    assert all(part in answer.said for part in parts), answer.said
+    line = "miss drives: " if parts else f"ok drives: CANopen, profile {profile}"
+    assert line in answer.said
 
 
 def test_drives_need_the_rig_and_a_profile_that_is_there(tmp_path: Path) -> None:

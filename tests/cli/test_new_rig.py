@@ -294,6 +294,24 @@ def test_anchors_in_the_world_frame_get_a_remark_from_new_and_doctor(tmp_path: P
         assert "remark anchors_mm: along z their middle is 445 mm from the platform's" in answer.err
 
 
+def test_cables_that_touch_at_home_get_a_remark_from_new_and_doctor(tmp_path: Path) -> None:
+    """Every jog there was refused for the start of a scene that was not given."""
+    rows = [
+        [500.25 * x, 500.5 * y, z, 62 * x, 62 * y, (470 - z) // 6]
+        for y, x, z in product((1, -1), (-1, 1), (860, 80))
+    ]
+    table, rig = tmp_path / "cables.csv", tmp_path / "rig.yaml"
+    lines = [",".join(CSV_COLUMNS), *(",".join(map(str, row)) for row in rows)]
+    table.write_text("\n".join(lines) + "\n")
+    for answer in (call("new", rig, "--from", table), call("doctor", rig)):
+        assert answer.code == 0, answer
+        assert answer.err.count("remark ") == 1, answer.err
+        assert "remark platform.home: cable 1 touches cable 2; " in answer.err
+    apart = tmp_path / "apart.yaml"
+    assert call("new", apart, "--from", cables_csv(tmp_path)).err == ""
+    assert "remark" not in call("doctor", apart).err
+
+
 def test_a_file_that_exists_is_kept(tmp_path: Path) -> None:
     rig = tmp_path / "rig.yaml"
     rig.write_text("mine")
