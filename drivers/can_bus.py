@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import can
-from can.interfaces.pcan.pcan import PCAN_BITRATES
+from can.interfaces.pcan.basic import PCAN_BITRATES
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
