@@ -19,7 +19,6 @@ from executor.recording.clearance import (
     clearance_table,
     encoder_rows,
     source_of,
-    tension_noise,
 )
 from executor.recording.mcap import write_mcap
 from executor.recording.record_files import AGAIN, RunCourse
@@ -57,12 +56,8 @@ from model.errors import BadInput, CdprError, Fault
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene
-from model.winches import WinchMap
 from tracking.clearance import MeasuredClearance, clearance_of
 from tracking.measurement import NoPose, PoseMeasurement
-
-#: Clearances from drive positions are computed this often along a run, [Hz].
-CLEARANCE_RATE = 10.0
 
 #: Files that `rewrite_report` makes from the others.
 _FROM_OTHERS = (FUSED, MCAP, REPORT)
@@ -407,18 +402,7 @@ def _clearance(rig: Rig, scene: Scene, cycles: CycleTable, seen: CameraRecords) 
     for name, samples in seen.alone.items():
         measured = [replace(sample, clearance=_clearance_at(model, sample)) for sample in samples]
         rows += _measured_rows(model, cycles, measured, source_of(name))
-    if model.obstacle_names and len(cycles):
-        every = max(1, round(1000.0 / (CLEARANCE_RATE * rig.document.bus.cycle_ms)))
-        chosen = np.arange(0, len(cycles), every)
-        chosen = chosen[cycles.has_encoder_pose[chosen]]
-        rows += encoder_rows(
-            model,
-            WinchMap(rig),
-            cycles.time[chosen],
-            _poses(cycles.encoder[chosen], cycles.encoder_rotation[chosen]),
-            _poses(cycles.planned[chosen], cycles.planned_rotation[chosen]),
-            tension_noise(rig, cycles.tensions),
-        )
+    rows += encoder_rows(model, cycles, scene.obstacle_clearance)
     return clearance_table(model.obstacle_names, rows)
 
 

@@ -20,6 +20,7 @@ from executor.recording.csv_columns import (
     numbers,
     texts,
 )
+from executor.recording.tables import CycleTable
 from model.clearance import ClearanceModel, Nearest
 from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Array, Pose
@@ -30,10 +31,6 @@ from tracking.clearance import MeasuredClearance, clearance_at
 _MM = 1e3
 _UNIT = re.compile(r"_mm( \(obstacle \d+\))?\Z")
 """End of the name of an obstacle's column, with its number if the name alone is not unique."""
-
-
-#: A measurement this far in time from a moment is one of that moment, [s].
-MEASURED_WITHIN = 0.5
 
 
 def source_of(camera: str) -> str:
@@ -200,6 +197,10 @@ def encoder_covariance(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) ->
 #: Errors that the covariance of an encoder pose does not include, [m]: forward kinematics assumes
 #: straight, massless cables and the calibrated rig.
 ALLOWANCE = 1e-4
+#: Clearances from the encoders are computed at least this often along a run, [Hz], and
+RATE = 10.0
+#: after at most this motion of the platform, [m], wherever a smaller one may lie in between.
+STEP = 0.005
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,31 +232,77 @@ class ClearanceRow:
         return cls(time, source, measured, spread, clearance.at_most, planned)
 
 
-def encoder_rows(
-    model: ClearanceModel,
-    winches: WinchMap,
-    times: Array,
-    measured: Sequence[Pose],
-    planned: Sequence[Pose],
-    noise: Array,
-) -> list[ClearanceRow]:
-    """A row for each encoder pose; none without an obstacle.
+def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> list[ClearanceRow]:
+    """Rows for encoder poses of a run, in order of time; none without an obstacle.
+
+    There are `RATE` per second. Between two poses the clearance changes by at most the motion of
+    the platform: where it may be below that of all rows, or below the required one, rows in the
+    middle are added until that motion is at most `STEP`.
 
     Args:
         model: Robot and scene.
-        winches: Of the robot.
-        times: Of n poses, shape (n,), [s].
-        measured: From the encoders, ``world_from_platform``.
-        planned: At the same times.
-        noise: Of the reported tensions, shape (m,), [N].
+        cycles: Of the run.
+        required: Clearance to the obstacles, [m].
     """
-    rows = []
-    for time, at, due in zip(times.tolist(), measured, planned, strict=True):
+    known = np.flatnonzero(cycles.has_encoder_pose)
+    every = max(1, round(1.0 / (RATE * model.rig.cycle)))
+    more = np.flatnonzero(known % every == 0)
+    if not (model.obstacle_names and more.size):
+        return []
+    motion, noise = _motion(model.rig, cycles, known), tension_noise(model.rig, cycles.tensions)
+    rows: dict[int, ClearanceRow] = {}
+    while more.size:
+        rows |= zip(more.tolist(), _rows_at(model, cycles, known[more], noise), strict=True)
+        at = np.array(sorted(rows))
+        near = np.array([_smallest(rows[k]) for k in at.tolist()])
+        apart = np.diff(motion[at])
+        at_least = (near[:-1] + near[1:] - apart[:, None]) / 2.0
+        is_unsure = (at_least < np.maximum(near.min(axis=0), required)).any(axis=1)
+        gaps = np.flatnonzero(is_unsure & (apart > STEP) & (np.diff(at) > 1))
+        more = (at[gaps] + at[gaps + 1]) // 2
+    return [rows[k] for k in sorted(rows)]
+
+
+def _rows_at(
+    model: ClearanceModel, cycles: CycleTable, chosen: NDArray[np.int64], noise: Array
+) -> list[ClearanceRow]:
+    """Rows for the encoder poses of some cycles; ``noise`` as from `tension_noise`."""
+    winches, rows = WinchMap(model.rig), []
+    for k in chosen.tolist():
+        at = Pose.from_quaternion(cycles.encoder[k], cycles.encoder_rotation[k])
+        due = Pose.from_quaternion(cycles.planned[k], cycles.planned_rotation[k])
         covariance = encoder_covariance(winches, model.rig, at, noise)
         clearance = clearance_at(model, at, covariance, ALLOWANCE)
         if clearance is not None:
+            time = float(cycles.time[k])
             rows.append(ClearanceRow.at(time, "encoder", clearance, model.obstacles(due)))
     return rows
+
+
+def _smallest(row: ClearanceRow) -> tuple[float, float]:
+    """The smallest distances of the measured and of the planned pose, [m]."""
+    return min(n.distance for n in row.measured), min(n.distance for n in row.planned)
+
+
+def _motion(rig: Rig, cycles: CycleTable, known: NDArray[np.int64]) -> Array:
+    """Upper bound of the path length of every point of the platform up to each encoder pose.
+
+    Args:
+        rig: The robot.
+        cycles: Of the run.
+        known: Cycles with an encoder pose, shape (n,).
+
+    Returns:
+        Shape (n,), [m].
+    """
+    points = np.vstack([rig.anchors, rig.platform_corners])
+    reach = float(np.linalg.norm(points, axis=1).max())
+    moved = np.linalg.norm(np.diff(cycles.encoder[known], axis=0), axis=1)
+    ends = cycles.encoder_rotation[known]
+    # Both signs of a quaternion are the same rotation.
+    chords = [np.linalg.norm(ends[1:] + sign * ends[:-1], axis=1) for sign in (-1.0, 1.0)]
+    rotated = 4.0 * np.arcsin(np.minimum(np.min(chords, axis=0) / 2.0, 1.0))
+    return np.concatenate([[0.0], np.cumsum(moved + reach * rotated)])
 
 
 def clearance_table(names: tuple[str, ...], rows: Sequence[ClearanceRow]) -> ClearanceTable:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.clearance import MEASURED_WITHIN, ClearanceTable
+from executor.recording.clearance import ClearanceTable
 from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import RunContext, judge
 from executor.trajectory.path import line
@@ -148,7 +148,7 @@ def _tag_error(poses: PoseTable, path_began: float) -> dict[str, float | int | N
 
 
 def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | None:
-    """The smallest clearance: the camera's if it measured there, else from the encoders."""
+    """The smallest clearance: the camera's unless it missed it, then that of the encoders."""
     for source in _measuring(clearance):
         rows = clearance.of(source)
         if len(rows) and np.isfinite(rows.distance).any():
@@ -169,17 +169,18 @@ def _clearance(clearance: ClearanceTable, required: float) -> dict[str, Any] | N
 def _measuring(clearance: ClearanceTable) -> tuple[str, ...]:
     """Sources of the smallest clearance, the best first.
 
-    The encoders come first where their smallest is below the camera's, and the camera gave no pose
-    at that time.
+    The encoders come first if the camera missed the smallest: theirs is below the camera's, and
+    below their own at the times of all camera poses by more than the uncertainty of each.
     """
     seen, counted = clearance.of("tag"), clearance.of("encoder")
-    known = np.isfinite(seen.distance)
-    if not (known.any() and np.isfinite(counted.distance).any()):
+    measured, known = np.isfinite(seen.distance), np.isfinite(counted.distance)
+    if not (measured.any() and known.any()):
         return ("tag", "encoder")
-    least = int(np.nanargmin(counted.distance))
-    gap = np.abs(seen.time[known] - counted.time[least]).min()
-    missed = gap > MEASURED_WITHIN and counted.distance[least] < np.nanmin(seen.distance)
-    return ("encoder", "tag") if missed else ("tag", "encoder")
+    least = counted.distance[known].min()
+    there = np.interp(seen.time[measured], counted.time[known], counted.distance[known])
+    missed = least < (there - seen.uncertainty[measured]).min()
+    below = least < seen.distance[measured].min()
+    return ("encoder", "tag") if missed and below else ("tag", "encoder")
 
 
 def _tension(cycles: CycleTable, rig: Rig) -> dict[str, float | None]:

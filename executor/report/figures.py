@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.clearance import ClearanceTable
+from executor.recording.clearance import RATE, ClearanceTable
 from executor.recording.verdict import following
 from executor.report.run_data import RunData
 from model.pages.charts import (
@@ -37,6 +37,8 @@ SMALL_POINTS = 300
 TOO_SMALL = 1e-6
 """A following error below this is not plotted, [m]."""
 _NAMES = {"tag": "measured (camera)", "encoder": "encoders"}
+_STEPS = {"tag": 0.0, "encoder": 1.0 / RATE}
+"""Largest step of clearances in time, where these are at uneven times, [s]."""
 
 
 def _whole(run: RunData) -> tuple[float, float]:
@@ -105,7 +107,7 @@ def _smallest(run: RunData) -> Chart:
     lines = []
     for rows in _sources(run.clearance):
         source = rows.source[0]
-        time, distance, low, high = with_gaps(rows.time, *_band(rows))
+        time, distance, low, high = with_gaps(rows.time, *_band(rows), step=_STEPS[source])
         lines.append(ChartLine(_NAMES[source], time, distance, source, band=(low, high)))
     every = _sources(run.clearance)[-1]
     planned = every.planned_distance * 1e3
@@ -132,8 +134,9 @@ def _band(rows: ClearanceTable) -> tuple[Array, Array, Array]:
 def _difference(run: RunData) -> Chart:
     """The best measurement minus the plan; its band should contain zero."""
     rows = _sources(run.clearance)[0]
-    planned = rows.planned_distance * 1e3
-    time, off, low, high = with_gaps(rows.time, *(values - planned for values in _band(rows)))
+    planned, step = rows.planned_distance * 1e3, _STEPS[rows.source[0]]
+    band = (values - planned for values in _band(rows))
+    time, off, low, high = with_gaps(rows.time, *band, step=step)
     name = _NAMES[rows.source[0]]
     zero = ChartLine("", np.array(_whole(run)), np.zeros(2), "planned", dash=DASHED)
     measured = ChartLine("difference", time, off, rows.source[0], 1.0, band=(low, high))
@@ -153,7 +156,8 @@ def _obstacle(run: RunData, index: int) -> Chart:
     lines = []
     for rows in _sources(run.clearance):
         near = rows.distances[:, index] * 1e3
-        time, distance = with_gaps(rows.time, near, most=SMALL_POINTS)
+        step = _STEPS[rows.source[0]]
+        time, distance = with_gaps(rows.time, near, most=SMALL_POINTS, step=step)
         by_camera = rows.source[0] == "tag"
         width, opacity = (4.0, 0.5) if by_camera else (1.3, 1.0)
         name = "camera" if by_camera else "drives"

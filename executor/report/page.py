@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 from numpy.typing import NDArray
 
-from executor.recording.clearance import MEASURED_WITHIN, ClearanceTable
+from executor.recording.clearance import ClearanceTable
 from executor.report.figures import (
     clearance_figure,
     length_figure,
@@ -52,6 +52,8 @@ MOST_MOMENTS = 400
 MOST_SEEN = 900
 """Camera poses of the path that is drawn."""
 MOST_BRANCHES = 4000
+MOST_APART = 0.5
+"""Largest time between a moment and the clearance shown with it, [s]."""
 #: Layer, its name on the page, the colour's role, whether it is shown at first.
 _LAYERS = (
     ("obstacles", "Obstacles", "obstacle", True),
@@ -173,12 +175,15 @@ def _motion(run: RunData) -> tuple[Moment, ...]:
 
 
 def _nearest(measured: Sequence[ClearanceTable], time: float) -> str:
-    """The clearance at a time, by the first source that measured it then."""
-    for clearance in measured:
+    """The clearance at a time: the camera's within a step of the encoders' rows, else theirs."""
+    camera, encoders = measured
+    after = int(np.searchsorted(encoders.time, time))
+    step = np.diff(encoders.time[max(after - 1, 0) : after + 1]).min(initial=MOST_APART)
+    for clearance, within in ((camera, step), (encoders, MOST_APART)):
         if not len(clearance):
             continue
         near = int(np.argmin(np.abs(clearance.time - time)))
-        if abs(clearance.time[near] - time) <= MEASURED_WITHIN:
+        if abs(clearance.time[near] - time) <= within:
             pair = f"{clearance.body[near]} – {clearance.obstacle[near]}"
             return f"clearance {clearance.distance[near] * 1e3:.1f} mm ({pair})"
     return ""

@@ -305,7 +305,9 @@ def thinned(time: Array, values: Array, most: int = MOST_POINTS) -> tuple[Array,
     return time[chosen], values[chosen]
 
 
-def with_gaps(time: Array, *columns: Array, most: int = MOST_POINTS) -> tuple[Array, ...]:
+def with_gaps(
+    time: Array, *columns: Array, most: int = MOST_POINTS, step: float = 0.0
+) -> tuple[Array, ...]:
     """Lines of common samples, thinned, with a NaN where samples are missing.
 
     A line then does not bridge the gap. At most about ``most`` points are left, among them every
@@ -315,11 +317,12 @@ def with_gaps(time: Array, *columns: Array, most: int = MOST_POINTS) -> tuple[Ar
         time: Shape (n,).
         columns: A line and the edges of its band, each of shape (n,).
         most: Points to keep.
+        step: Largest step in time of samples of which none is missing, if their steps differ.
     """
     if len(time) < 3:
         return (time, *columns)
     steps = np.diff(time)
-    gaps = np.flatnonzero(steps > 2.5 * np.median(steps)) + 1
+    gaps = np.flatnonzero(steps > 2.5 * max(float(np.median(steps)), step)) + 1
     time = np.insert(time, gaps, (time[gaps - 1] + time[gaps]) / 2.0)
     columns = tuple(np.insert(column, gaps, np.nan) for column in columns)
     if len(time) <= most:

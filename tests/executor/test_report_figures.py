@@ -78,6 +78,12 @@ def test_an_even_line_is_not_broken() -> None:
     np.testing.assert_array_equal(value, time)
 
 
+def test_a_line_whose_samples_are_denser_in_places_is_broken_only_beyond_its_largest_step() -> None:
+    time = np.concatenate([np.linspace(0.0, 1.0, 101), np.linspace(1.1, 2.0, 10), [3.0]])
+    at, value = with_gaps(time, time, step=0.1)
+    assert at[np.isnan(value)] == pytest.approx([2.5])
+
+
 VALUES = st.floats(-1e3, 1e3)
 
 

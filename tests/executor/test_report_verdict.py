@@ -17,10 +17,11 @@ from executor.recording.run_folder import RunEvent
 from executor.recording.summary import _clearance, summarize
 from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import distances, encoder_pose, following, replies, tensions
+from executor.report.page import _nearest
 from executor.report.tiles import chips
 from executor.trajectory.path import rounded
 from model.files.scene_file import StopDocument
-from model.pose import Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.statics.wrench_sets import rms_anchor_radius
 from tests.executor import fake_run
 
@@ -472,6 +473,52 @@ def test_the_smallest_clearance_is_the_encoders_where_no_camera_looked(
     assert found["source"] == source
     if source == "encoder":
         assert found["measured_min"] == pytest.approx(table.of("encoder").distance.min() * 1e3)
+
+
+def passing_a_post(speed: float, camera_at: Array, off: float = 0.0) -> ClearanceTable:
+    """A platform that passes a post at 22 mm after 2 s.
+
+    Args:
+        speed: Its speed, [m/s].
+        camera_at: Times of the images, shape (n,), [s].
+        off: By how much the encoders measure too little, [m].
+    """
+
+    def rows_of(source: str, times: Array, less: float, spread: float) -> ClearanceTable:
+        distance = np.hypot(0.022, speed * (times - 2.0)) - less
+        of_post = ("platform",) * len(times), ("post",) * len(times), distance, ("post",)
+        uncertainty, each = np.full(len(times), spread), distance[:, None]
+        names = (source,) * len(times)
+        at_most = distance + uncertainty
+        return ClearanceTable(times, names, distance, uncertainty, at_most, *of_post, each, each)
+
+    encoders = rows_of("encoder", np.arange(0.0, 4.0, 0.1), off, 1.5e-4)
+    return joined(rows_of("tag", camera_at, 0.0, 2e-3), encoders)
+
+
+def test_a_camera_that_missed_the_smallest_clearance_does_not_replace_the_encoders() -> None:
+    """Images 0.25 s before and after it, at 0.5 m/s: 127 mm, while the encoders measured 22 mm."""
+    table = passing_a_post(0.5, np.arange(0.25, 4.0, 0.5))
+    found = _clearance(table, 0.020)
+    assert found is not None
+    assert found["source"] == "encoder"
+    assert found["measured_min"] == pytest.approx(22.0)
+    measured = [table.of("tag"), table.of("encoder")]
+    assert _nearest(measured, 2.0).startswith("clearance 22.0 mm")
+    assert _nearest(measured, 1.76).startswith("clearance 126.9 mm")
+    slow = passing_a_post(0.005, np.arange(0.25, 4.0, 0.5))
+    assert _nearest([slow.of("tag"), slow.of("encoder")], 2.0).startswith("clearance 22.0 mm")
+
+
+@pytest.mark.parametrize("speed", [0.005, 0.5])
+def test_a_camera_that_saw_the_smallest_clearance_counts_before_other_encoders(
+    speed: float,
+) -> None:
+    """Encoders of a rig that is described wrongly measure too little everywhere."""
+    found = _clearance(passing_a_post(speed, np.arange(0.0, 4.0, 0.5), off=0.005), 0.020)
+    assert found is not None
+    assert found["source"] == "tag"
+    assert found["measured_min"] == pytest.approx(22.0)
 
 
 def test_planned_and_travelled_length_of_a_turning_path_are_of_one_measure(
