@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from executor.recording.clearance import ClearanceTable
+from executor.recording.summary import versions
 from executor.report.figures import (
     clearance_figure,
     length_figure,
@@ -294,6 +295,8 @@ def _timing(run: RunData) -> str:
 
 
 def _footer(run: RunData) -> str:
-    version = run.summary["versions"].get("cdpr")
-    maker = f"cdpr {version}" if version else "cdpr"
-    return f"Made by {maker} from the files of the run folder; times count from its start."
+    maker, runner = versions()["cdpr"], run.summary["versions"].get("cdpr")
+    made = f"Made by cdpr {maker}"
+    if runner not in (None, maker):
+        made = f"Run with cdpr {runner}; page made by cdpr {maker}"
+    return f"{made} from the files of the run folder; times count from its start."

@@ -14,6 +14,7 @@ import pytest
 from executor.recording.clearance import no_clearance
 from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent, RunFolder
+from executor.recording.summary import versions
 from executor.recording.tables import CycleTable, PoseTable
 from executor.report import build_report
 from executor.report.run_data import read_run
@@ -240,6 +241,19 @@ def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(
     assert f"{rms:.2f} mm RMS" in rows[1]
     assert "RMS" not in rows[2]
     assert f"{rms:.2f}" != f"{1e3 * np.sqrt(np.nanmean(poses.error**2)):.2f}"
+
+
+def test_the_page_names_its_maker_and_the_program_that_ran(
+    tmp_path: Path, run: fake_run.FakeRun
+) -> None:
+    own = versions()["cdpr"]
+    for name, ran, made in (
+        ("own", own, f"Made by cdpr {own} from"),
+        ("older", "0.0.1", f"Run with cdpr 0.0.1; page made by cdpr {own} from"),
+    ):
+        context = fake_run.changed(run.context, versions={"cdpr": ran})
+        page = built(replace(run, context=context), tmp_path / name)
+        assert f"<footer>{made} the files of the run folder" in page.text
 
 
 def test_a_scene_without_obstacles_reports_it(tmp_path: Path, run: fake_run.FakeRun) -> None:
