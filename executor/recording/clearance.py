@@ -236,8 +236,8 @@ def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> 
     """Rows for encoder poses of a run, in order of time; none without an obstacle.
 
     There are `RATE` per second. Between two poses the clearance changes by at most the motion of
-    the platform: where it may be below that of all rows, or below the required one, rows are added
-    half way in between until that motion is at most `STEP`.
+    the platform: where it may be below that of all rows, or below the required one, rows in the
+    middle are added until that motion is at most `STEP`.
 
     Args:
         model: Robot and scene.
