@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, Gamma
-from model.pose import Array, require_real, skew
+from model.pose import Array, Pose, require_real, skew
 from model.rig import Camera
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 1e-9)
@@ -158,17 +158,80 @@ def ray_slopes(camera: Camera, rays: Array) -> Array:
     Returns:
         Shape (p, 2, n), [m] per unit of each of the n parameters.
     """
+    points = np.column_stack([rays, np.ones(len(rays))])
+    by_point, by_lens = _projection_slopes(camera, points)
+    return np.asarray(-np.linalg.solve(by_point[..., :2], by_lens))
+
+
+def _projection_slopes(camera: Camera, points: Array) -> tuple[Array, Array]:
+    """Derivatives of image pixels by n points, (n, 2, 3), and by lens parameters, (n, 2, k)."""
     zero, count = np.zeros(3), 4 + camera.distortion.size
-    points = np.column_stack([rays, np.ones(len(rays))]).reshape(-1, 1, 3)
+    flat = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 1, 3)
     if camera.lens == FISHEYE:
-        by = cv2.fisheye.projectPoints(points, zero, zero, camera.matrix, camera.distortion)[1]
-        slopes = np.asarray(by, dtype=np.float64).reshape(len(rays), 2, -1)
-        by_ray, by_lens = slopes[..., 11:13], slopes[..., :8]
+        by = cv2.fisheye.projectPoints(flat, zero, zero, camera.matrix, camera.distortion)[1]
+        by_point, by_lens = slice(11, 14), slice(0, 8)
     else:
-        by = cv2.projectPoints(points, zero, zero, camera.matrix, camera.distortion)[1]
-        slopes = np.asarray(by, dtype=np.float64).reshape(len(rays), 2, -1)
-        by_ray, by_lens = slopes[..., 3:5], slopes[..., 6 : 6 + count]
-    return np.asarray(-np.linalg.solve(by_ray, by_lens))
+        by = cv2.projectPoints(flat, zero, zero, camera.matrix, camera.distortion)[1]
+        by_point, by_lens = slice(3, 6), slice(6, 6 + count)
+    slopes = np.asarray(by, dtype=np.float64).reshape(len(flat), 2, -1)
+    return slopes[..., by_point], slopes[..., by_lens]
+
+
+def image_slopes(camera: Camera, points: Array) -> Array:
+    """Derivatives of image pixels by points in front of the camera.
+
+    Args:
+        camera: The camera.
+        points: Camera frame, shape (..., 3), [m].
+
+    Returns:
+        Shape (..., 2, 3), [px/m].
+    """
+    return np.asarray(_projection_slopes(camera, points)[0].reshape(*points.shape[:-1], 2, 3))
+
+
+def point_slopes(camera: Camera, points: Array) -> Array:
+    """Derivatives of undistorted pixels by points; arguments as in `image_slopes`.
+
+    Returns:
+        Shape (..., 2, 3), [px/m].
+    """
+    slopes = np.zeros((*points.shape[:-1], 2, 3))
+    depth = points[..., 2]
+    for axis in range(2):
+        focal = camera.matrix[axis, axis]
+        slopes[..., axis, axis] = focal / depth
+        slopes[..., axis, 2] = -focal * points[..., axis] / depth**2
+    return slopes
+
+
+def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
+    """Derivatives of undistorted pixels by shift [m] and rotation [rad], camera axes.
+
+    Args:
+        camera: The camera.
+        points: In the body's frame, shape (..., 3), [m].
+        pose: ``camera_from_body``.
+
+    Returns:
+        Shape (..., 2, 6), [px].
+    """
+    arms = points @ pose.rotation.T
+    by_point = point_slopes(camera, arms + pose.position)
+    by_turn = _cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
+    return np.concatenate([by_point, by_turn], axis=-1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Cross product along the last axis; np.cross takes four times as long on small arrays."""
+    return np.stack(
+        [
+            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
+            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
+            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
+        ],
+        axis=-1,
+    )
 
 
 def undistorted_slopes(camera: Camera, undistorted: Array) -> Array:
@@ -185,16 +248,58 @@ def undistorted_slopes(camera: Camera, undistorted: Array) -> Array:
     return np.asarray(ray_slopes(camera, (undistorted - middle) / focal) * focal[:, None])
 
 
+def directions(camera: Camera, undistorted: Array) -> Array:
+    """Points of the rays through undistorted pixels, shape (n, 2), 1 m in front; shape (n, 3)."""
+    flat = np.asarray(undistorted, dtype=np.float64)
+    rays = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(camera.matrix).T
+    return np.asarray(rays)
+
+
 def distort_pixels(camera: Camera, undistorted: Array) -> Array:
     """Applies the lens distortion to points, shape (..., 2), [px]; same shape."""
-    flat = np.asarray(undistorted, dtype=np.float64).reshape(-1, 2)
-    rays = np.column_stack([flat, np.ones(len(flat))]) @ np.linalg.inv(camera.matrix).T
+    rays = directions(camera, undistorted.reshape(-1, 2))
     return pixels_of(camera, rays).reshape(undistorted.shape)
 
 
 def pixels_of(camera: Camera, points_in_camera: Array) -> Array:
     """Distorted pixels of points in front of the camera, shape (n, 3), [m]; shape (n, 2)."""
     return project(camera.lens, camera.matrix, camera.distortion, points_in_camera)
+
+
+def reprojection_errors(camera: Camera, points: Array, undistorted: Array) -> Array:
+    """Errors of points in the image, lens distortion included.
+
+    Args:
+        camera: The camera.
+        points: In front of it, camera frame, shape (..., 3), [m].
+        undistorted: Where they are measured, shape (..., 2), [px] without distortion.
+
+    Returns:
+        Expected minus measured image pixels, shape (..., 2), [px].
+    """
+    expected = pixels_of(camera, points).reshape(undistorted.shape)
+    return np.asarray(expected - distort_pixels(camera, undistorted))
+
+
+def sight_offsets(camera: Camera, points: Array, undistorted: Array) -> Array:
+    """Offsets of points from the lines of sight through pixels without distortion.
+
+    Args:
+        camera: The camera.
+        points: Camera frame, shape (n, 3), [m].
+        undistorted: Shape (n, 2), [px].
+
+    Returns:
+        Shape (n, 3), [m].
+    """
+    rays = directions(camera, undistorted)
+    along = np.sum(points * rays, axis=1) / np.sum(rays**2, axis=1)
+    return np.asarray(points - along[:, None] * rays)
+
+
+def rms(vectors: Array) -> Array:
+    """Root mean square length of vectors, shape (..., n, k); shape (...)."""
+    return np.asarray(np.sqrt(np.mean(np.sum(vectors**2, axis=-1), axis=-1)))
 
 
 _ROUND_TRIP = 0.01

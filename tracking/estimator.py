@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.cameras import Z_95
-from model.pose import Pose, read_only
+from model.pose import Array, Pose, read_only
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted
+from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted, rms
 from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import carries_tag, modules_across, tag_corners, view_angle
@@ -32,8 +32,8 @@ class TrackerSettings:
     """Acceptance limits of a pose, and the camera check.
 
     Attributes:
-        reprojection_px: Largest RMS error of the corners, beside that from the stated error of the
-            tags.
+        reprojection_px: Largest RMS error of the corners in the image, beside that from the stated
+            error of the tags.
         view_angle: Largest angle between line of sight and a tag's normal, [rad].
         position_deviation: Largest standard deviation of the position along any direction, [m].
         jump: Largest distance from the last pose beyond what `speed` allows, [m].
@@ -46,8 +46,8 @@ class TrackerSettings:
             and of the tags' error. In good images it is about 1.
         doubt: The same where more than `left_out_share` of the edges were left out.
         left_out_share: Share of edges that may be left out, [1].
-        camera_moved_px: Error of frame tags above which the camera counts as moved, beside that
-            from the stated error of its pose.
+        camera_moved_px: Error of frame tags in the image above which the camera counts as moved,
+            beside that from the stated error of its pose.
         camera_check_period: Images between checks of the camera.
     """
 
@@ -100,10 +100,11 @@ def find_consensus(
         possible: Whether ``camera_from_body`` is a possible pose.
     """
     found: list[tuple[int, float, Pose, list[TagView]]] = []
+    squares = [(view, distort_pixels(camera, view.seen.corners)) for view in views]
     for view in views:
         for pose in square_poses(camera, view):
             if possible(pose):
-                fitting = _fitting(camera, views, pose)
+                fitting = _fitting(camera, squares, pose)
                 misfit = sum(gap for gap, _ in fitting.values()) / max(1, len(fitting))
                 found.append((len(fitting), misfit, pose, [v for _, v in fitting.values()]))
     if not found:
@@ -120,20 +121,19 @@ def find_consensus(
 
 
 def _fitting(
-    camera: Camera, views: Sequence[TagView], pose: Pose
+    camera: Camera, squares: Sequence[tuple[TagView, Array]], pose: Pose
 ) -> dict[int, tuple[float, TagView]]:
-    """The best-fitting square of each tag with its misfit, where one fits a pose."""
+    """The best-fitting square of each tag with its misfit, where one fits a pose.
+
+    Squares have their corners in the image, shape (4, 2), [px].
+    """
     best: dict[int, tuple[float, TagView]] = {}
-    for view in views:
+    for view, seen in squares:
         points = pose.apply(tag_corners(view.tag))
         if np.any(points[:, 2] < 1e-3):
             continue
-        seen = view.seen.corners
-        side = float(np.sqrt(np.mean(np.sum((seen - np.roll(seen, 1, axis=0)) ** 2, axis=1))))
-        gap = float(
-            np.sqrt(np.mean(np.sum((project_undistorted(camera, points) - seen) ** 2, axis=1)))
-        )
-        near = gap < max(LEAST_AGREEMENT, AGREEMENT * side)
+        gap = float(rms(pixels_of(camera, points) - seen))
+        near = gap < max(LEAST_AGREEMENT, AGREEMENT * float(rms(seen - np.roll(seen, 1, axis=0))))
         if near and (view.tag.id not in best or gap < best[view.tag.id][0]):
             best[view.tag.id] = (gap, view)
     return best
@@ -367,7 +367,7 @@ class PlatformEstimator:
         return f"no platform tag ({self._rig.tag_family} {wanted}) detected{also}"
 
     def _scale(self, bundle: BundlePose) -> float:
-        """Pixels per metre at the platform's distance."""
+        """Pixels of the image per metre at the platform's distance, as on the axis."""
         distance = float(np.linalg.norm(bundle.camera_from_body.position))
         return float(self._camera.matrix[0, 0]) / distance
 

@@ -14,12 +14,19 @@ from functools import cached_property
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
 from model.cameras import Z_95
 from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
 from model.rig import Camera, Tag
-from tracking.camera_model import project_undistorted
+from tracking.camera_model import (
+    image_slopes,
+    pose_slopes,
+    project_undistorted,
+    reprojection_errors,
+    rms,
+)
 from tracking.detection.tags import CORNER_SIGNS, tag_corners
 from tracking.edges.refine import RefinedTag
 
@@ -49,32 +56,29 @@ class TagView:
     seen: RefinedTag
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class BundlePose:
     """The fitted pose of a body.
 
     Attributes:
+        squares: The tags.
         camera_from_body: The pose.
         covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
         cost: Huber cost of the edges, in variances.
         second_best_cost: Cost of the second-best, or mirror, pose; infinite without one.
         freedom: Degrees of freedom: edge errors minus six.
         edge_errors: Of each tag's edges, in deviations, 0 where hidden, shape (t, 4).
-        corner_errors: RMS error of each tag's corners, shape (t,), [px]; of partly hidden tags, of
-            the measured edges.
-        certainties: Information of each tag's edges, shape (t,), [1/px²].
         displaced: Numbers of tags left out because they are not where the pose puts them.
         second_best: The second-best pose, if there is one.
     """
 
+    squares: Squares
     camera_from_body: Pose
     covariance: Array
     cost: float
     second_best_cost: float
     freedom: int
     edge_errors: Array
-    corner_errors: Array
-    certainties: Array
     displaced: tuple[int, ...] = ()
     second_best: Pose | None = None
 
@@ -100,33 +104,41 @@ class BundlePose:
         factor = stdtrit(max(expected, FEWEST), 0.5 + COVERAGE / 2.0) / Z_95
         return max(usual, self.cost / max(expected, 1.0) * float(factor) ** 2)
 
-    @property
+    # In the image: pixels of the fit are undistorted, and larger off the axis of a wide lens.
+
+    @cached_property
+    def _points(self) -> Array:
+        return self.camera_from_body.apply(self.squares.corners)
+
+    @cached_property
+    def _variances(self) -> Array:
+        """Of the edges' offsets and tilts, 0 where hidden, shape (t, 8), [px²]."""
+        squares, depth = self.squares, self._points[..., 2, None, None]
+        focal = squares.camera.matrix[[0, 1], [0, 1]]
+        by_undistorted = image_slopes(squares.camera, self._points)[..., :2] * depth / focal
+        whitening = squares.whitening.reshape(-1, 8, 4, 2).swapaxes(1, 2)
+        information = np.sum((whitening @ np.linalg.inv(by_undistorted)) ** 2, axis=(1, 3))
+        is_measured = np.repeat(squares.edges, 2, axis=1)
+        variances = np.zeros(information.shape)
+        np.divide(1.0, information, where=is_measured, out=variances)
+        return variances
+
+    @cached_property
+    def certainties(self) -> Array:
+        """Information of each tag's edges, shape (t,), [1/px²]."""
+        return np.asarray(2.0 * self.squares.edges.sum(axis=1) / self._variances.sum(axis=1))
+
+    @cached_property
     def reprojection(self) -> float:
-        """RMS error of all tags' corners, each tag weighted by its edges' information, [px]."""
-        return float(np.sqrt(np.average(self.corner_errors**2, weights=self.certainties)))
+        """RMS error of all tags' corners, each tag weighted by its certainty, [px].
 
-
-def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
-    """Derivatives of undistorted pixels by shift [m] and rotation [rad], camera axes.
-
-    Args:
-        camera: The camera.
-        points: In the body's frame, shape (..., 3), [m].
-        pose: ``camera_from_body``.
-
-    Returns:
-        Shape (..., 2, 6), [px].
-    """
-    arms = points @ pose.rotation.T
-    there = arms + pose.position
-    by_point = np.zeros((*there.shape[:-1], 2, 3))
-    depth = there[..., 2]
-    for axis in range(2):
-        focal = camera.matrix[axis, axis]
-        by_point[..., axis, axis] = focal / depth
-        by_point[..., axis, 2] = -focal * there[..., axis] / depth**2
-    by_turn = _cross(arms[..., None, :], by_point)  # d(turn × arm) seen through by_point
-    return np.concatenate([by_point, by_turn], axis=-1)
+        Of partly hidden tags, that of the measured edges.
+        """
+        squares, count = self.squares, self.squares.edges.sum(axis=1)
+        corners = rms(reprojection_errors(squares.camera, self._points, squares.seen))
+        offsets = (squares.errors(self.camera_from_body) ** 2 * self._variances)[:, ::2]
+        squared = np.where(count == 4, corners**2, offsets.sum(axis=1) / count)
+        return float(np.sqrt(np.average(squared, weights=self.certainties)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,6 +149,8 @@ class Squares:
     corners: Array  # (t, 4, 3)
     whitening: Array  # (t, 8, 8)
     target: Array  # (t, 8)
+    seen: Array  # (t, 4, 2)
+    edges: NDArray[np.bool_]  # (t, 4)
 
     @classmethod
     def of(cls, camera: Camera, views: Sequence[TagView]) -> Squares:
@@ -146,6 +160,8 @@ class Squares:
             np.array([tag_corners(v.tag) for v in views]),
             np.array([v.seen.whitening for v in views]),
             np.array([v.seen.target for v in views]),
+            np.array([v.seen.corners for v in views]),
+            np.array([v.seen.edges for v in views]),
         )
 
     @cached_property
@@ -189,35 +205,33 @@ def solve_pnp(
     starts = [pose for pose in starts if _in_front(squares, pose)]
     ranked = sorted(starts, key=lambda pose: _huber(squares.errors(pose)))
     rivals = _different(ranked[1:], ranked[:1])[:1] if squares.normal is None else []
-    return _best(squares, views, ranked[:1] + rivals)
+    return _best(squares, ranked[:1] + rivals)
 
 
 def solve_near(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
     """Refines a pose, or its mirror pose if tags in one plane fit that better."""
-    squares = Squares.of(camera, views)
-    return _best(squares, views, [start] if _in_front(squares, start) else [])
+    return _best(Squares.of(camera, views), [start])
 
 
-def _best(squares: Squares, views: Sequence[TagView], starts: list[Pose]) -> BundlePose | None:
+def _best(squares: Squares, starts: list[Pose]) -> BundlePose | None:
     """The best of the refined poses and, of tags in one plane, of their mirror poses."""
-    found = [_costed(squares, start) for start in starts]
+    found = _costed(squares, starts)
     if found and squares.normal is not None:
-        mirror = _mirrored(squares, found[0][1], squares.normal)
-        found += [_costed(squares, mirror)] if _in_front(squares, mirror) else []
+        found += _costed(squares, [_mirrored(squares, found[0][1], squares.normal)])
     if not found:
         return None
     found.sort(key=lambda item: item[0])
     cost, best = found[0]
     for other, rival in found[1:]:
         if not _same(rival, best):
-            result = _result(squares, views, best, cost, other)
-            return replace(result, second_best=rival)
-    return _result(squares, views, best, cost, math.inf)
+            return replace(_result(squares, best, cost, other), second_best=rival)
+    return _result(squares, best, cost, math.inf)
 
 
-def _costed(squares: Squares, start: Pose) -> tuple[float, Pose]:
-    pose = _refined(squares, start)
-    return _huber(squares.errors(pose)), pose
+def _costed(squares: Squares, starts: Sequence[Pose]) -> list[tuple[float, Pose]]:
+    """The refined poses, and their costs, of those starts that are in front of the camera."""
+    poses = [_refined(squares, start) for start in starts if _in_front(squares, start)]
+    return [(_huber(squares.errors(pose)), pose) for pose in poses]
 
 
 def _mirrored(squares: Squares, pose: Pose, normal: Array) -> Pose:
@@ -235,10 +249,9 @@ def _mirrored(squares: Squares, pose: Pose, normal: Array) -> Pose:
 def refine_pnp(camera: Camera, views: Sequence[TagView], start: Pose) -> BundlePose | None:
     """Refines a pose known to be the right one; considers no alternative."""
     squares = Squares.of(camera, views)
-    if not _in_front(squares, start):
-        return None
-    cost, pose = _costed(squares, start)
-    return _result(squares, views, pose, cost, math.inf)
+    for cost, pose in _costed(squares, [start]):
+        return _result(squares, pose, cost, math.inf)
+    return None
 
 
 def square_poses(camera: Camera, view: TagView) -> list[Pose]:
@@ -336,18 +349,6 @@ def displaced_tag(
     return None
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Cross product along the last axis; np.cross takes four times as long on small arrays."""
-    return np.stack(
-        [
-            a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1],
-            a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2],
-            a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0],
-        ],
-        axis=-1,
-    )
-
-
 def _in_front(squares: Squares, pose: Pose) -> bool:
     return bool(np.all(pose.apply(squares.corners)[..., 2] > 1e-3))
 
@@ -405,46 +406,22 @@ def _refined(squares: Squares, pose: Pose) -> Pose:
     return pose
 
 
-def _result(
-    squares: Squares, views: Sequence[TagView], pose: Pose, cost: float, rival: float
-) -> BundlePose:
+def _result(squares: Squares, pose: Pose, cost: float, rival: float) -> BundlePose:
     errors = squares.errors(pose)
     jacobian = squares.jacobian(pose).reshape(-1, 6)
     normal = jacobian.T @ (jacobian * huber_weights(errors)[:, None])
-    freedom = 2 * sum(int(v.seen.edges.sum()) for v in views) - 6
+    freedom = 2 * int(squares.edges.sum()) - 6
     try:
         covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError:  # too few edges for six parameters
         covariance = np.full((6, 6), np.inf)
     found = BundlePose(
+        squares,
         pose,
         covariance,
         cost,
         rival,
         max(freedom, 0),
         read_only(_edge_sizes(errors)),
-        read_only(_corner_errors(squares, views, pose)),
-        read_only(np.array([_certainty(view.seen) for view in views])),
     )
     return replace(found, covariance=read_only(found.misfit(found.freedom) * covariance))
-
-
-def _certainty(seen: RefinedTag) -> float:
-    """Inverse variance of a tag's corners from its edges' offsets and tilts, [1/px²]."""
-    rows = np.sum(seen.whitening**2, axis=1)[np.repeat(seen.edges, 2)]
-    return float(1.0 / np.mean(1.0 / rows))
-
-
-def _corner_errors(squares: Squares, views: Sequence[TagView], pose: Pose) -> Array:
-    """RMS error of the corners of each tag, shape (t,), [px]."""
-    pixels = project_undistorted(squares.camera, pose.apply(squares.corners))
-    result = []
-    for view, corners, errors in zip(views, pixels, squares.errors(pose), strict=True):
-        if view.seen.whole:
-            gap = corners - view.seen.corners
-            result.append(float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))))
-            continue
-        # For a partly hidden square: offsets of its visible edges, in pixels.
-        rows = np.linalg.norm(view.seen.whitening[::2], axis=1)[view.seen.edges]
-        result.append(float(np.sqrt(np.mean((errors[::2][view.seen.edges] / rows) ** 2))))
-    return np.array(result)

@@ -20,9 +20,12 @@ from model.pose import Array, Pose, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import (
     lever_arm_matrix,
-    project_undistorted,
+    point_slopes,
     ray_slopes,
     rays_of,
+    reprojection_errors,
+    rms,
+    sight_offsets,
     undistorted_slopes,
 )
 from tracking.clearance import missing_errors
@@ -109,16 +112,12 @@ class SharedErrors:
 
     def _pixels_by_tags(self, views: Sequence[TagView], camera_from_body: Pose) -> Array:
         """Derivatives of the same by unit errors of each tag's pose, shape (t, 8, 6 t)."""
-        matrix = self._camera.matrix
         slopes = np.zeros((len(views), 8, 6 * len(views)))
         for k, view in enumerate(views):
             shifts = camera_from_body.rotation @ tag_error_slopes(view.tag, self._tag_error)
             points = camera_from_body.apply(tag_corners(view.tag))
-            for corner, (x, y, z) in enumerate(points):
-                by_point = np.array([[1.0, 0.0, -x / z], [0.0, 1.0, -y / z]]) / z
-                by_point *= np.array([[matrix[0, 0]], [matrix[1, 1]]])
-                rows = slice(2 * corner, 2 * corner + 2)
-                slopes[k, rows, 6 * k : 6 * k + 6] = by_point @ shifts[corner]
+            by_tag = point_slopes(self._camera, points) @ shifts
+            slopes[k, :, 6 * k : 6 * k + 6] = by_tag.reshape(8, 6)
         return slopes
 
 
@@ -253,9 +252,9 @@ class CameraCheck:
 
     Attributes:
         tags: Numbers of the completely visible tags.
-        errors: RMS error of each tag's corners, shape (t,), [px].
-        distances: The same at each tag's distance, shape (t,), [m].
-        gaps: Expected minus measured corners, shape (t, 4, 2), [px].
+        errors: RMS error of each tag's corners in the image, shape (t,), [px].
+        distances: The same from their lines of sight, shape (t,), [m].
+        gaps: Expected minus measured corners in the image, shape (t, 4, 2), [px].
     """
 
     tags: tuple[int, ...]
@@ -277,8 +276,7 @@ class CameraCheck:
         """Whether tags seen in both checks are at the same positions, by the median of them."""
         both = [k for k, tag in enumerate(self.tags) if tag in other.tags]
         changes = [self.gaps[k] - other.gaps[other.tags.index(self.tags[k])] for k in both]
-        errors = [np.sqrt(np.mean(np.sum(change**2, axis=1))) for change in changes]
-        return not errors or float(np.median(errors)) <= limit_px
+        return not both or float(np.median(rms(np.array(changes)))) <= limit_px
 
 
 def check_camera(camera: Camera, views: Sequence[TagView]) -> CameraCheck:
@@ -288,10 +286,9 @@ def check_camera(camera: Camera, views: Sequence[TagView]) -> CameraCheck:
     errors, distances, gaps = [], [], []
     for view in whole:
         points = camera_from_world.apply(tag_corners(view.tag))
-        gap = project_undistorted(camera, points) - view.seen.corners
-        gaps.append(gap)
-        errors.append(float(np.sqrt(np.mean(np.sum(gap**2, axis=1)))))
-        distances.append(errors[-1] * float(points[:, 2].mean()) / float(camera.matrix[0, 0]))
+        gaps.append(reprojection_errors(camera, points, view.seen.corners))
+        errors.append(float(rms(gaps[-1])))
+        distances.append(float(rms(sight_offsets(camera, points, view.seen.corners))))
     tags = tuple(view.tag.id for view in whole)
     return CameraCheck(tags, read_only(errors), read_only(distances), read_only(gaps))
 

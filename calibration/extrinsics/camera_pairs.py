@@ -55,11 +55,13 @@ from model.rig import Camera, Rig
 from tracking.camera_model import (
     Image,
     lever_arm_matrix,
+    pose_slopes,
     project_undistorted,
+    reprojection_errors,
+    rms,
     undistort_pixels,
     undistorted_slopes,
 )
-from tracking.pnp import pose_slopes
 from tracking.shared_errors import moved_by_pixels, pixels_by_lens, split_extrinsics
 
 LEAST_PAIRS = 4
@@ -77,7 +79,7 @@ class BodyObservation:
     Attributes:
         camera_from_body: Its pose in the camera frame.
         covariance: Of position and rotation vector along the camera's axes, shape (6, 6), [m, rad].
-        error: RMS of its corners, [px].
+        error: RMS of its corners in the image, [px].
         corners: Of each tag or point of it, shape (4, 2) or (2,), [px].
         by_lens: Derivatives of the pose by the n parameters of the camera's lens, camera axes,
             shape (6, n); None where their errors are unknown.
@@ -98,7 +100,7 @@ def observe_platform(
     rig: Rig, camera: Camera, observations: TagObservations
 ) -> dict[str, BodyObservation]:
     """The platform in every image in which its tags give a unique pose."""
-    found = {}
+    found, corners = {}, observations.corners(camera)
     for name, squares in observations.squares.items():
         bundle = platform_pose(rig, camera, squares)
         if bundle is None:
@@ -112,7 +114,7 @@ def observe_platform(
             bundle.camera_from_body,
             bundle.covariance,
             bundle.reprojection,
-            {number: square.corners for number, square in squares.items()},
+            dict(corners[name].items()),
             by_lens,
         )
     return found
@@ -150,7 +152,7 @@ def _board_pose(seen: DetectedBoard, camera: Camera) -> BodyObservation | None:
     errors = undistorted - project_undistorted(camera, pose.apply(seen.points))
     freedom = max(errors.size - 6, 1)
     scatter = max(float(np.sum(errors**2)) / freedom, _LEAST_SCATTER**2)
-    error = float(np.sqrt(np.mean(np.sum(errors**2, axis=1))))
+    error = float(rms(reprojection_errors(camera, pose.apply(seen.points), undistorted)))
     covariance = np.asarray(scatter * np.linalg.inv(slopes.T @ slopes))
     corners = zip(map(tuple, seen.points.tolist()), seen.corners, strict=True)
     by_lens = None

@@ -145,7 +145,7 @@ def locate_by_motion(
     Raises:
         BadInput: Too few images have a pose.
     """
-    observations = observations.without_duplicates()
+    observations = observations.without_duplicates(camera)
     unknown = {name: "has no pose" for name in observations.squares if name not in poses}
     observations = observations.without(unknown)
     found = {

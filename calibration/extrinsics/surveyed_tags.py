@@ -20,7 +20,14 @@ from model.cameras import Z_95
 from model.errors import BadInput
 from model.pose import Array, Pose, moved, read_only, skew, step_between
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import project_undistorted, undistorted_slopes
+from tracking.camera_model import (
+    point_slopes,
+    project_undistorted,
+    reprojection_errors,
+    rms,
+    sight_offsets,
+    undistorted_slopes,
+)
 from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.edges.refine import RefinedTag
 from tracking.pnp import TagView, solve_pnp
@@ -60,9 +67,7 @@ class Survey:
 def pixel_slopes(camera: Camera, camera_from_world: Pose, points: Array) -> Array:
     """Derivative of undistorted pixels by world points (n, 3), shape (2 n, 3 n), [px/m]."""
     slopes = np.zeros((2 * len(points), 3 * len(points)))
-    fx, fy = camera.matrix[0, 0], camera.matrix[1, 1]
-    for k, (x, y, z) in enumerate(camera_from_world.apply(points)):
-        by_camera = np.array([[fx / z, 0.0, -fx * x / z**2], [0.0, fy / z, -fy * y / z**2]])
+    for k, by_camera in enumerate(point_slopes(camera, camera_from_world.apply(points))):
         slopes[2 * k : 2 * k + 2, 3 * k : 3 * k + 3] = by_camera @ camera_from_world.rotation
     return slopes
 
@@ -79,7 +84,10 @@ _OFF = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SeenTag:
-    """A tag over all images: world corners (4, 3), mean pixels (8,), their whitening (8, 8)."""
+    """A tag over all images: world corners (4, 3), mean pixels (8,), their whitening (8, 8).
+
+    The pixels are without distortion.
+    """
 
     number: int
     corners: Array
@@ -87,7 +95,7 @@ class _SeenTag:
     whitening: Array
 
     def errors(self, camera: Camera, camera_from_world: Pose) -> Array:
-        """Errors of the corners, shape (8,), [px]."""
+        """Errors of the corners without distortion, shape (8,), [px]."""
         points = camera_from_world.apply(self.corners)
         return np.asarray(project_undistorted(camera, points).reshape(8) - self.pixels)
 
@@ -156,7 +164,7 @@ def locate_by_frame_tags(
         half_widths=read_only(Z_95 * np.sqrt(np.diag(covariance))),
         by_lens=by_lens,
         points=workspace_corners(rig),
-        tag_errors={t.number: float(np.sqrt(np.mean(t.errors(camera, best) ** 2))) for t in tags},
+        tag_errors={tag.number: _image_error(camera, tag, best) for tag in tags},
         pictures=len(observations.squares),
         unused={**observations.unused, **unused},
         issues=tuple(issues),
@@ -187,10 +195,7 @@ def _without_moved_images(camera: Camera, observations: TagObservations) -> TagO
     Raises:
         BadInput: Half of the images or more have moved.
     """
-    corners = {
-        name: {number: square.corners for number, square in squares.items()}
-        for name, squares in observations.squares.items()
-    }
+    corners = observations.corners(camera)
     groups = [
         [one for one in corners.values() if _shift(one, other) <= MOVED_PX]
         for other in corners.values()
@@ -297,10 +302,14 @@ def _reject_outliers(
     return tags, outliers
 
 
+def _image_error(camera: Camera, tag: _SeenTag, best: Pose) -> float:
+    """RMS error of a tag's corners in the image, of each coordinate, [px]."""
+    points, seen = best.apply(tag.corners), tag.pixels.reshape(4, 2)
+    return float(np.sqrt(np.mean(reprojection_errors(camera, points, seen) ** 2)))
+
+
 def _offset_message(camera: Camera, tag: _SeenTag, best: Pose) -> str:
-    depth = float(best.apply(tag.corners)[:, 2].mean())
-    pixels = float(np.sqrt(2.0 * np.mean(tag.errors(camera, best) ** 2)))
-    away = pixels * depth / float(camera.matrix[0, 0])
+    away = rms(sight_offsets(camera, best.apply(tag.corners), tag.pixels.reshape(4, 2)))
     return f"is measured at least {away * 1e3:.1f} mm from its position in the rig file"
 
 

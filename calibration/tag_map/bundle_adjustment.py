@@ -270,7 +270,7 @@ def measure_layout(
         for name, squares in observations.squares.items()
         if len(squares) < 2
     }
-    observations = observations.without(single).without_duplicates()
+    observations = observations.without(single).without_duplicates(camera)
     starts, observations = initial_poses(camera, nominal, observations)
     located = connected_tags([tuple(squares) for squares in observations.squares.values()], fixed)
     used = _only_located(observations, located, fixed)

@@ -15,7 +15,14 @@ from calibration.statistics import duplicate_views
 from model.errors import BadInput
 from model.pose import Array, Pose, moved
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import Image, project_undistorted
+from tracking.camera_model import (
+    Image,
+    distort_pixels,
+    point_slopes,
+    project_undistorted,
+    reprojection_errors,
+    rms,
+)
 from tracking.detection.detector import Detection, make_detector
 from tracking.detection.diagnostics import diagnose_tags
 from tracking.detection.tags import CORNER_SIGNS, modules_across
@@ -46,13 +53,16 @@ class TagObservations:
         remaining = {name: squares for name, squares in self.squares.items() if name not in unused}
         return TagObservations(remaining, {**self.unused, **unused})
 
-    def without_duplicates(self) -> TagObservations:
-        """Without images that duplicate the view of another image with as many tags or more."""
-        corners = {
-            name: {number: square.corners for number, square in squares.items()}
-            for name, squares in self.squares.items()
+    def corners(self, camera: Camera) -> dict[str, dict[int, Array]]:
+        """Corners in the image, shape (4, 2), [px], by tag number, by image name."""
+        return {
+            name: {number: distort_pixels(camera, square.corners) for number, square in one.items()}
+            for name, one in self.squares.items()
         }
-        return self.without(duplicate_views(corners))
+
+    def without_duplicates(self, camera: Camera) -> TagObservations:
+        """Without images that duplicate the view of another image with as many tags or more."""
+        return self.without(duplicate_views(self.corners(camera)))
 
     def data_hash(self) -> str:
         """Hash of the observations."""
@@ -221,12 +231,7 @@ class TagViews:
     def slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array]:
         """Jacobians of the errors by camera pose and by tag pose, shape (v, 8, 6) each."""
         points, arms_camera, arms_tag = self._points(cameras, tags)
-        depth = points[..., 2]
-        by_point = np.zeros((*points.shape[:2], 2, 3))
-        for axis in range(2):
-            focal = self.camera.matrix[axis, axis]
-            by_point[..., axis, axis] = focal / depth
-            by_point[..., axis, 2] = -focal * points[..., axis] / depth**2
+        by_point = point_slopes(self.camera, points)
         turn = np.array([pose.rotation for pose in cameras])[self.picture]
         by_position = np.einsum("vcij,vjk->vcik", by_point, turn)
         by_camera = np.concatenate([by_point, np.cross(arms_camera[:, :, None], by_point)], -1)
@@ -277,12 +282,11 @@ class TagViews:
         return informations, scores, float(np.sum(errors**2)) / max(freedom, 1)
 
     def image_errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> list[float]:
-        """RMS corner error of each image, [px]."""
+        """RMS corner error in each image, [px]."""
         points, _, _ = self._points(cameras, tags)
-        pixels = project_undistorted(self.camera, points).reshape(-1, 8)
-        measured = np.linalg.solve(self.whitening, self.target[..., None])[..., 0]
-        squares = np.sum((pixels - measured) ** 2, axis=1) / 4.0
-        return [float(np.sqrt(squares[self.picture == k].mean())) for k in range(len(cameras))]
+        measured: Array = np.asarray(np.linalg.solve(self.whitening, self.target[..., None]))
+        errors = reprojection_errors(self.camera, points, measured.reshape(-1, 4, 2))
+        return [float(rms(errors[self.picture == k].reshape(-1, 2))) for k in range(len(cameras))]
 
     def _points(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> tuple[Array, Array, Array]:
         """Corners in the camera frame, (v, 4, 3); lever arms of camera and tag rotations."""

@@ -140,7 +140,7 @@ def test_of_two_views_of_one_pose_the_one_with_more_tags_counts(rig: Rig) -> Non
     assert len(squares) > 1
     fewer = dict(list(squares.items())[:1])
     for order in ({"a": fewer, "b": squares}, {"b": squares, "a": fewer}):
-        once = TagObservations(order, {}).without_duplicates()
+        once = TagObservations(order, {}).without_duplicates(rig.cameras[0])
         assert set(once.squares) == {"b"}
         assert once.unused == {"a": "duplicates b: nothing moved in between"}
 
