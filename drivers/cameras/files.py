@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import pairwise
@@ -15,16 +14,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import Frame, Image, eight_bits
+from drivers.cameras.live import SPLIT, Frame, Image, eight_bits
 from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
-from model.files.reading import IMAGE_LIMIT, files_in, is_folder, is_too_large, read_bytes
+from model.files.reading import (
+    IMAGE_LIMIT,
+    exif_orientation,
+    files_in,
+    is_folder,
+    is_too_large,
+    page_count,
+    read_bytes,
+)
 from model.rig import Camera
 
 #: Suffixes of image files, in lower case.
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".webp")
-#: An EXIF block begins within so many bytes and is no longer, [bytes].
-EXIF_WITHIN = 65536
 _GREY_LEVELS = (np.uint8, np.uint16)
 _ON_ITS_SIDE = range(5, 9)  # EXIF orientations that swap width and height
 _NO_IMAGE, _CAMERA = "is not a readable image", "the camera has"
@@ -170,11 +175,12 @@ def image_name(path: Path) -> str:
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Image | None:
-    """The grey image of a file, or None if it has none; also for names that OpenCV cannot open.
+    """The grey image of a file, or None if it has none, or several.
 
-    It is as the sensor stored it, like that of a live camera: a camera that points down states its
-    orientation at random, and an image rotated by 180° has another principal point. Only one that
-    has the camera's size once rotated as its EXIF data say, by 90°, is rotated.
+    Names that OpenCV cannot open are read too. The image is as the sensor stored it, like that of a
+    live camera: a camera that points down states its orientation at random, and an image rotated by
+    180° has another principal point. Only one that has the camera's size once rotated as its EXIF
+    data say, by 90°, is rotated.
 
     Args:
         path: The file.
@@ -224,13 +230,16 @@ def _shown(stored: tuple[int, int], orientation: int) -> tuple[int, int]:
 
 
 def _decoded(data: bytes, upright: bool = False) -> Image | None:
-    picture = _raw(data, upright)
+    picture = _raw(data, upright) if page_count(data) == 1 else None
     return None if picture is None or picture.dtype not in _GREY_LEVELS else eight_bits(picture)
 
 
 def _unreadable(path: Path) -> str:
     """Why a file is not used."""
-    picture = _raw(_data(path))
+    data = _data(path)
+    if (pages := page_count(data)) > 1:
+        return f"has {pages} pages; {SPLIT}"
+    picture = _raw(data)
     if picture is None:
         return _NO_IMAGE
     return f"has values of type {picture.dtype}; only integers of 8 to 16 bits can be used"
@@ -246,23 +255,6 @@ def _raw(data: bytes, upright: bool = False) -> NDArray[np.generic] | None:
     except cv2.error:
         return None
     return None if picture is None else np.asarray(picture)
-
-
-def exif_orientation(data: bytes) -> int:
-    """The orientation in a JPEG file's EXIF data, 1 to 8; 1 if it states none."""
-    at = data.find(b"Exif\0\0", 0, EXIF_WITHIN)
-    tiff = data[at + 6 : at + EXIF_WITHIN]
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if at < 0 or order is None:
-        return 1
-    with suppress(struct.error):
-        (first,) = struct.unpack_from(f"{order}I", tiff, 4)
-        (count,) = struct.unpack_from(f"{order}H", tiff, first)
-        for entry in range(count):
-            tag, _, _, value = struct.unpack_from(f"{order}HHIH", tiff, first + 2 + 12 * entry)
-            if tag == 0x0112:
-                return int(value)
-    return 1
 
 
 def _other_size(size: tuple[int, int], owner: str, wanted: tuple[int, int]) -> str:

@@ -23,7 +23,7 @@ from model.errors import (
     StoppedByOperator,
     without_passwords,
 )
-from model.files.reading import MOST_PIXELS
+from model.files.reading import IMAGE_LIMIT, MOST_PIXELS, page_count, read_bytes
 from model.rig import Camera
 
 # The newest image of a camera that delivers them faster than they are used.
@@ -150,6 +150,8 @@ def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
 
 
 Image = NDArray[np.uint8]
+SPLIT = "save each image as a file of its own"
+"""Next step for a file of several images."""
 LAST_CAMERA = 255
 """Largest camera index on Linux; OpenCV takes larger numbers as ports of other drivers."""
 
@@ -183,14 +185,16 @@ class VideoFile:
         rate: Images per second that the file states (default: the camera's), [Hz].
 
     Raises:
-        BadInput: The file is missing, or is not a video; its images have to be rotated by 90°, and
-            the camera has a rolling shutter.
+        BadInput: The file is missing, or is not a video, or is an image of several pages; its
+            images have to be rotated by 90°, and the camera has a rolling shutter.
     """
 
     def __init__(self, path: Path, camera: Camera) -> None:
         if not path.is_file():
             raise BadInput("no such file", where=str(path), next_step="check the path")
         self._path, self._camera = path, camera
+        if path.suffix.lower() in (".tif", ".tiff"):
+            _refuse_pages(path)
         capture = _opened_video(path, camera)
         if not capture.isOpened():
             raise BadInput(
@@ -202,14 +206,11 @@ class VideoFile:
         self._count = max(0, int(count)) if 0 <= count < 1e9 else 0
         rate = capture.get(cv2.CAP_PROP_FPS)
         self.rate = rate if np.isfinite(rate) and rate > 0 else camera.rate
-        width, height = (
-            capture.get(cv2.CAP_PROP_FRAME_WIDTH),
-            capture.get(cv2.CAP_PROP_FRAME_HEIGHT),
-        )
+        width, height = _size(capture)
         capture.release()
         if width * height > MOST_PIXELS:
             raise BadInput(
-                f"the video states images of {width:.0f} x {height:.0f} px",
+                f"the video states images of {width} x {height} px",
                 where=str(path),
                 why="the file is damaged",
                 next_step="use another file",
@@ -373,6 +374,13 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
             why="the image is from another camera, or was cropped or scaled",
             next_step="use full-size images of this camera, or calibrate it at this size",
         )
+
+
+def _refuse_pages(path: Path) -> None:
+    """Refuses a TIFF file of several images, of which OpenCV reads the first as a video."""
+    if (pages := page_count(read_bytes(path, IMAGE_LIMIT))) > 1:
+        what = f"the file has {pages} pages"
+        raise BadInput(what, where=str(path), next_step=f"{SPLIT}, and name their folder")
 
 
 def video_size(path: Path) -> tuple[int, int]:

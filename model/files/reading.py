@@ -14,6 +14,8 @@ import stat
 import struct
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -288,6 +290,57 @@ def _jpeg(data: bytes) -> tuple[int, int] | None:
             return int(width), int(height)
         (length,) = struct.unpack_from(">H", data, at)
         at += max(2, length)
+
+
+# Entries of a TIFF file, and of EXIF data.
+#
+# Source: TIFF revision 6.0 (Adobe), section 2; a file has one directory per image.
+
+
+_SHORT, _WIDTH, _HEIGHT, _KIND, _ORIENTATION = 3, 0x100, 0x101, 0xFE, 0x112
+_NO_PAGE = 0b101  # a thumbnail, or a mask
+_MOST_ENTRIES = 1_000_000
+_EXIF_WITHIN = 65536
+"""Largest offset of an EXIF block in a file, and its largest length, [bytes]."""
+
+
+def _tiff_entries(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Directory from 0, tag and number of each entry; nothing of other files."""
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    if order is None:
+        return
+    known: set[int] = set()  # directories of a damaged file may form a circle
+    with suppress(struct.error):
+        (at,) = struct.unpack_from(f"{order}I", data, 4)
+        while at and at not in known:
+            (entries,) = struct.unpack_from(f"{order}H", data, at)
+            for start in range(at + 2, at + 2 + 12 * entries, 12):
+                tag, kind = struct.unpack_from(f"{order}HH", data, start)
+                form = "H" if kind == _SHORT else "I"
+                (value,) = struct.unpack_from(f"{order}{form}", data, start + 8)
+                yield len(known), tag, value
+            known.add(at)
+            (at,) = struct.unpack_from(f"{order}I", data, at + 2 + 12 * entries)
+
+
+def page_count(data: bytes) -> int:
+    """Number of images of the first one's size in a TIFF file; 1 for other files."""
+    pages: dict[int, dict[int, int]] = {}
+    for directory, tag, value in islice(_tiff_entries(data), _MOST_ENTRIES):
+        pages.setdefault(directory, {})[tag] = value
+    sizes = [
+        (page.get(_WIDTH), page.get(_HEIGHT))
+        for page in pages.values()
+        if not page.get(_KIND, 0) & _NO_PAGE
+    ]
+    return max(1, sizes.count(sizes[0])) if sizes else 1
+
+
+def exif_orientation(data: bytes) -> int:
+    """The orientation in a JPEG file's EXIF data, 1 to 8; 1 if it states none."""
+    tiff = data[: 2 * _EXIF_WITHIN].partition(b"Exif\0\0")[2]
+    first = (entry[1:] for entry in _tiff_entries(tiff) if entry[0] == 0)
+    return next((value for tag, value in first if tag == _ORIENTATION), 1)
 
 
 # Tables.

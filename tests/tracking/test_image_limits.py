@@ -15,9 +15,11 @@ import cv2
 import numpy as np
 import pytest
 
-from drivers.cameras.files import ImageOutput, read_image
-from model.errors import Fault
-from model.files.reading import MOST_PIXELS, is_too_large, stated_size
+from drivers.cameras.files import ImageFolder, ImageOutput, SingleCameraImages, read_image
+from drivers.cameras.live import VideoFile
+from model.cameras import generic_camera
+from model.errors import BadInput, Fault
+from model.files.reading import MOST_PIXELS, is_too_large, page_count, stated_size
 
 IMAGE = np.full((48, 64, 3), 90, np.uint8)
 
@@ -161,3 +163,80 @@ def test_pictures_whose_names_differ_only_in_their_ending_are_both_kept(tmp_path
         for name in ("a.jpg", "a.png", "a.jpg"):
             out.write(IMAGE, name)
     assert sorted(p.name for p in (tmp_path / "drawn").iterdir()) == ["a.png", "a.png.png"]
+
+
+GREY = IMAGE[..., 0]
+SPLIT = "save each image as a file of its own"
+
+
+def test_a_tiff_file_of_several_pages_is_not_used_and_the_reason_states_them(
+    tmp_path: Path,
+) -> None:
+    """Its first page alone was used, without a word about the others."""
+    stack, camera = tmp_path / "stack.tif", generic_camera((64, 48))
+    cv2.imwritemulti(str(stack), [GREY, GREY + 1, GREY + 2])
+    for read in (lambda: SingleCameraImages(tmp_path), lambda: list(ImageFolder(tmp_path, camera))):
+        with pytest.raises(BadInput, match="none of the 1 files is a readable image") as caught:
+            read()
+        assert caught.value.why == f"stack.tif has 3 pages; {SPLIT}"
+    with pytest.raises(BadInput, match="has 3 pages") as caught:
+        VideoFile(stack, camera)
+    assert SPLIT in caught.value.next_step
+    cv2.imwrite(str(tmp_path / "one.TIFF"), GREY)
+    folder, calibrated = ImageFolder(tmp_path, camera), SingleCameraImages(tmp_path)
+    assert [frame.name for frame in folder] == list(calibrated.names) == ["one.TIFF"]
+    assert folder.unused == calibrated.unused == {"stack.tif": f"has 3 pages; {SPLIT}"}
+    assert len(list(VideoFile(tmp_path / "one.TIFF", camera))) == 1
+
+
+def test_a_tiff_file_with_a_thumbnail_is_an_image(tmp_path: Path) -> None:
+    for name, first in (("a.tif", GREY), ("b.tif", GREY.astype(np.uint16) * 16)):
+        cv2.imwritemulti(str(tmp_path / name), [first, first[::4, ::4]])
+        image = read_image(tmp_path / name)
+        assert image is not None
+        assert image.shape == GREY.shape
+
+
+def directory(order: str, following: int, entries: list[tuple[int, int, int]]) -> bytes:
+    """A directory of a TIFF file: tag, type (3: 16 bits, 4: 32 bits) and value of each entry."""
+    body = struct.pack(f"{order}H", len(entries))
+    for tag, kind, value in entries:
+        body += struct.pack(f"{order}HHI{'H2x' if kind == 3 else 'I'}", tag, kind, 1, value)
+    return body + struct.pack(f"{order}I", following)
+
+
+def tiff(order: str, *directories: list[tuple[int, int, int]]) -> bytes:
+    data = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(f"{order}I", 8)
+    for k, entries in enumerate(directories):
+        end = len(data) + 6 + 12 * len(entries)
+        data += directory(order, end if k < len(directories) - 1 else 0, entries)
+    return data
+
+
+WIDE, HIGH, KIND = 256, 257, 254
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize("number", [3, 4])
+@pytest.mark.parametrize(("kind", "pages"), [(None, 2), (0, 2), (2, 2), (1, 1), (4, 1), (5, 1)])
+def test_thumbnails_and_masks_are_no_pages(
+    order: str, number: int, kind: int | None, pages: int
+) -> None:
+    """Source: TIFF 6.0, NewSubfileType: bit 0 a reduced image, bit 1 a page, bit 2 a mask."""
+    size = [(WIDE, number, 64), (HIGH, number, 48)]
+    second = size if kind is None else [(KIND, 4, kind), *size]
+    assert page_count(tiff(order, size, second)) == pages
+    smaller = [(WIDE, number, 16), (HIGH, number, 12)]
+    assert page_count(tiff(order, size, second, smaller)) == pages
+
+
+def test_damaged_directories_end() -> None:
+    size = [(WIDE, 3, 64), (HIGH, 3, 48)]
+    whole = tiff("<", size, size)
+    assert page_count(whole) == 2
+    for end in range(len(whole)):
+        assert page_count(whole[:end]) in (1, 2)
+    for entries in ([], size):
+        circle = b"II*\0" + struct.pack("<I", 8) + directory("<", 8, entries)
+        assert page_count(circle) == 1
+    assert page_count(IMAGE.tobytes()) == page_count(b"") == 1
