@@ -390,8 +390,8 @@ def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dic
     own, where = plain[name] if isinstance(plain[name], Mapping) else {}, f"{name}: "
     kind, model = str(own.get("camera_model")), str(own.get("distortion_model"))
     if kind != "pinhole" or model not in _KALIBR_MODELS:
-        why = f"{name} is {kind}-{model}; pinhole-radtan and pinhole-equi(distant) can be read"
-        raise _unusable(path, why)
+        known = ", ".join(_KALIBR_MODELS)
+        raise _unusable(path, f"{name} is {kind}-{model}; pinhole with {known} can be read")
     ours, count = _KALIBR_MODELS[model]
     lens = _at(own, "distortion_coeffs", path, where)
     if len(lens) != count:

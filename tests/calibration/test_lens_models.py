@@ -496,6 +496,19 @@ def test_kalibr_models_that_rig_files_lack_are_named(rig, tmp_path) -> None:
     assert "cam0 is ds-radtan" in str(caught.value.why)
 
 
+def test_the_models_named_for_kalibr_are_those_that_are_read(rig, tmp_path) -> None:
+    """Its option is `pinhole-equi`, its files say `equidistant`."""
+    file, plain = tmp_path / "camchain.yaml", rig.document.cameras[0]
+    text = KALIBR.replace("distortion_model: radtan", "distortion_model: MODEL", 1)
+    file.write_text(text.replace("MODEL", "equi"))
+    with pytest.raises(BadInput) as caught:
+        imported_camera(file, plain, "cam0")
+    why = str(caught.value.why)
+    assert why == "cam0 is pinhole-equi; pinhole with radtan, equidistant, none can be read"
+    file.write_text(text.replace("MODEL", "equidistant"))
+    assert imported_camera(file, plain, "cam0").lens == "fisheye"
+
+
 MRCAL = """# generated on 2024-01-01 with mrcal-calibrate-cameras
 # 'lensmodel': 'LENSMODEL_SPLINED'
 {
