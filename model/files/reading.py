@@ -318,7 +318,7 @@ _SHORT, _WIDTH, _HEIGHT, _KIND, _ORIENTATION = 3, 0x100, 0x101, 0xFE, 0x112
 _NO_PAGE = 0b101  # a thumbnail, or a mask
 _MOST_ENTRIES = 1_000_000
 _EXIF_WITHIN = 65536
-"""An EXIF block begins within this many bytes and is no longer, [bytes]."""
+"""Largest offset of an EXIF block in a file, and its largest length, [bytes]."""
 
 
 def _tiff_entries(data: bytes) -> Iterator[tuple[int, int, int]]:
