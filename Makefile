@@ -5,7 +5,7 @@ SHELL := /bin/sh
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
-REPLACED := $(VENV)-replaced
+REPLACED := $(VENV:/=)-replaced
 # Where pip.conf says `user = true`, pip refuses an environment otherwise.
 PIP := install --no-user --quiet --disable-pip-version-check
 QUICK := -q -n 2 -m "not slow" --ignore tests/repository
@@ -57,8 +57,7 @@ install:  ## Create .venv and install everything into it, pinned (once)
 	put_back() { \
 	  if [ -e "$(REPLACED)/installed" ]; then \
 	    rm -rf "$(VENV)" && mv "$(REPLACED)" "$(VENV)" && \
-	    echo "The installation failed; the previous one is in $(VENV) again. Next: repeat it with a network;" \
-	      "without one, try the previous one: . $(BIN)/activate" >&2; fi; }; \
+	    echo "The installation failed; what was in $(VENV) is there again. Next: repeat it with a network" >&2; fi; }; \
 	trap put_back EXIT; \
 	trap 'exit 1' HUP INT TERM; \
 	"$(PYTHON)" -m venv "$(VENV)" && \

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import can
-from can.interfaces.pcan.basic import PCAN_BITRATES
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
@@ -177,16 +176,24 @@ def _close_unopened(error: Exception) -> None:
 def _options(settings: BusSettings) -> dict[str, Any]:
     if settings.interface == "udp_multicast":
         return _udp_options(settings)
-    if settings.interface == "pcan" and settings.bitrate not in PCAN_BITRATES:
-        raise BadInput(  # python-can would use 500 kbit/s
-            f"adapters by PEAK have no bit rate of {settings.bitrate} bit/s",
-            where="bus.bitrate",
-            next_step=f"use one of: {', '.join(map(str, sorted(PCAN_BITRATES)))}",
-        )
+    if settings.interface == "pcan":
+        _require_rate_of_pcan(settings.bitrate)
     options: dict[str, Any] = {"channel": settings.channel, "bitrate": settings.bitrate}
     if settings.interface == "neovi":  # its default is to receive them
         options["receive_own_messages"] = False
     return options
+
+
+def _require_rate_of_pcan(bitrate: int) -> None:
+    """Requires a bit rate of these adapters; python-can would use 500 kbit/s for any other."""
+    from can.interfaces.pcan.basic import PCAN_BITRATES  # its import prints a warning
+
+    if bitrate not in PCAN_BITRATES:
+        raise BadInput(
+            f"adapters by PEAK have no bit rate of {bitrate} bit/s",
+            where="bus.bitrate",
+            next_step=f"use one of: {', '.join(map(str, sorted(PCAN_BITRATES)))}",
+        )
 
 
 def _udp_options(settings: BusSettings) -> dict[str, Any]:

@@ -334,8 +334,9 @@ def _controller(found: KernelInterface, again: str) -> MachineCheck:
     if hindering:
         why = "; ".join(UNUSABLE_MODES[mode] for mode in hindering)
         text, healthy, fix = f"{text}, {', '.join(hindering)}: {why}", False, again
-    # While down it has no state to report; `_up` reports that.
-    return MachineCheck(f"controller of {found.name}", healthy or not found.up, text, fix)
+    elif not found.up:
+        healthy = True  # it has no state to report; `_up` reports that
+    return MachineCheck(f"controller of {found.name}", healthy, text, fix)
 
 
 # Real time.

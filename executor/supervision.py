@@ -239,7 +239,7 @@ def ctrl_c_interrupts() -> Iterator[None]:
     """Replaces the handler of an event loop, so that Ctrl-C raises `KeyboardInterrupt`.
 
     In a coroutine, Ctrl-C would otherwise have no effect before the next ``await``, so that the
-    platform would still move to the goal. A handler set by the program itself stays.
+    platform would still move to the goal. One that the program set with `signal.signal` stays.
     """
     former = signal.getsignal(signal.SIGINT)
     is_main = threading.current_thread() is threading.main_thread()  # others may set no handler
@@ -272,7 +272,7 @@ def _belongs_to_event_loop(handler: object) -> bool:
 class Supervisor:
     """Turns an interrupt of the calling program into a coordinated stop.
 
-    This one handles no signals, so that the library works from any thread: the motion runs in its
+    This one sets no handler, so that the library works from any thread: the motion runs in its
     own thread, and a `KeyboardInterrupt` in the calling thread requests the stop. It is raised
     again once the drives hold and the record is written. A program that handles signals itself,
     as the command line does, overrides the methods.

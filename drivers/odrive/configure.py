@@ -323,9 +323,10 @@ def _answers(
         if len(received) == len(nodes):
             return received
     there = {node for node, _ in link.answers(*alive)} if alive else set()
-    if old := ", ".join(str(node) for node in nodes if node in there and node not in received):
-        raise _no_version(old)
-    silent = ", ".join(str(node) for node in nodes if node not in received)
+    missing = [node for node in nodes if node not in received]
+    silent = ", ".join(map(str, missing))
+    if there.issuperset(missing):
+        raise _no_version(silent)
     adapter = ", or an adapter without remote frames" if asked else ""
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",

@@ -152,11 +152,13 @@ class OdriveMonitor:
         report = next((each for each in reports if not self.heard(each)), reports[0])
         overdue = [drive for drive, late in enumerate(self.overdue(report)) if late]
         silent = [drive for drive in overdue if (report, drive) not in self._not_numbers]
-        names = ", ".join(str(self.nodes[drive]) for drive in silent or overdue)
+        names = ", ".join(
+            str(self.nodes[drive]) for drive in silent or overdue or range(len(self.nodes))
+        )
         no_number = ": it is not a number" if overdue and not silent else ""
         why, next_step = NO_NUMBER[report] if no_number else NO_REPORT[report]
         return HardwareMissing(
-            f"no {report} from drives {names or 'all'}{no_number}",
+            f"no {report} from drives {names}{no_number}",
             where=where,
             why=why,
             next_step=next_step,

@@ -235,7 +235,7 @@ class ClearanceRow:
 def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> list[ClearanceRow]:
     """Rows for encoder poses of a run, in order of time; none without an obstacle.
 
-    There are `RATE` per second. Between two poses the clearance changes by at most the motion of
+    There are `RATE` per second, and one at either end of a record in motion. Between two poses the clearance changes by at most the motion of
     the platform: where it may be below that of all rows, or below the required one, rows in the
     middle are added until that motion is at most `STEP`.
 
@@ -250,6 +250,9 @@ def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> 
     if not (model.obstacle_names and more.size):
         return []
     motion, noise = _motion(model.rig, cycles, known), tension_noise(model.rig, cycles.tensions)
+    ends = [(0, more[0]), (known.size - 1, more[-1])]  # of a record that ends in motion
+    more = np.union1d(more, [k for k, row in ends if abs(motion[k] - motion[row]) > STEP])
+    more = more.astype(np.int64)
     rows: dict[int, ClearanceRow] = {}
     while more.size:
         rows |= zip(more.tolist(), _rows_at(model, cycles, known[more], noise), strict=True)

@@ -175,15 +175,16 @@ def _measuring(clearance: ClearanceTable) -> tuple[str, ...]:
     """Sources of the smallest clearance, the best first.
 
     The encoders come first if the camera missed the smallest: theirs is below the camera's, and
-    below their own at the times of all camera poses by more than the uncertainty of each.
+    below their own at the times of all camera poses by more than the uncertainties of both.
     """
     seen, counted = clearance.of("tag"), clearance.of("encoder")
     measured, known = np.isfinite(seen.distance), np.isfinite(counted.distance)
     if not (measured.any() and known.any()):
         return ("tag", "encoder")
-    least = counted.distance[known].min()
+    nearest = int(np.nanargmin(counted.distance))
+    least = counted.distance[nearest]
     there = np.interp(seen.time[measured], counted.time[known], counted.distance[known])
-    missed = least < (there - seen.uncertainty[measured]).min()
+    missed = least + counted.uncertainty[nearest] < (there - seen.uncertainty[measured]).min()
     below = least < seen.distance[measured].min()
     return ("encoder", "tag") if missed and below else ("tag", "encoder")
 

@@ -68,8 +68,11 @@ def find_examples(configs: Path, sessions: Path) -> list[Example]:
 
 
 def _ready_file(path: Path) -> Example | None:
-    """The rig or scene; None where the first line names no schema."""
-    text = read_text(path)
+    """The rig or scene; None where the first line names no schema, or there is no text."""
+    try:
+        text = read_text(path)
+    except BadInput:
+        return None
     first, second, *_ = [*text.splitlines(), "", ""]
     kind = _SCHEMA.search(first)
     if kind is None:

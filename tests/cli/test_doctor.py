@@ -164,6 +164,8 @@ def test_a_controller_in_a_mode_that_hinders_is_named_with_its_cure(mode: str) -
     assert not answer.good
     assert f"ERROR-ACTIVE, {mode}: " in answer.text
     assert answer.fix.endswith(f"type can bitrate 1000000 {mode.lower()} off")
+    down = looked(flags=["NOARP"], linkinfo={"info_kind": "can", "info_data": info})
+    assert not down["controller of can0"].good
     info["ctrlmode"] = ["FD", "BERR-REPORTING"]
     good = looked(linkinfo={"info_kind": "can", "info_data": info})["controller of can0"]
     assert good.good

@@ -29,6 +29,8 @@ def test_files_of_the_user_s_own_do_not_break_the_list(tmp_path: Path) -> None:
     (tmp_path / "rig.yaml").write_text((CONFIGS / "gachon_8_6.yaml").read_text())
     (tmp_path / "marked.yaml").write_text("# yaml-language-server: $schema=a/scene.schema.json")
     (tmp_path / "empty.yaml").touch()
+    (tmp_path / "latin.yaml").write_bytes("# Gelände\n".encode("latin-1"))
+    (tmp_path / "folder.yaml").mkdir()
     (tmp_path / "unmarked.yaml").write_text("schema_version: 1\nname: mine\n")
     (tmp_path / ".#rig.yaml").symlink_to("anna@lab.1234")
     (tmp_path / "session").mkdir()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import gc
+import subprocess
+import sys
 from pathlib import Path
 
 import can
@@ -169,6 +171,14 @@ def test_a_controller_that_cannot_command_drives_is_not_opened(
     assert "sudo ip link set can0 down && sudo ip link set can0 up" in caught.value.next_step
     for mode in modes:
         assert (f" {mode.lower()} off" in caught.value.next_step) == (mode in what)
+
+
+def test_importing_the_bus_prints_nothing() -> None:
+    """python-can warns where its module for adapters by PEAK is imported."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import drivers.can_bus"], capture_output=True, text=True, check=True
+    )
+    assert done.stdout == done.stderr == ""
 
 
 def test_a_bit_rate_that_an_adapter_by_peak_does_not_have_is_refused() -> None:

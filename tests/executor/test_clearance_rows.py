@@ -84,6 +84,20 @@ def test_rows_are_added_only_where_the_smallest_may_lie(passage: Passage) -> Non
     assert table.distance == pytest.approx(passage.clearance[cycles], abs=1e-6)
 
 
+@pytest.mark.parametrize("ends_after", [1, 5, 9])
+def test_a_record_that_ends_in_motion_has_a_row_at_its_end(
+    passage: Passage, ends_after: int
+) -> None:
+    """As at a collision: the last tenth of a second counted only up to its beginning."""
+    nearest = int(np.argmin(passage.clearance))
+    first = nearest - 20 - ends_after
+    line = passage.line[first - first % 10 : nearest + 1]
+    table = measured(passage.rig, passage.scene, line)
+    assert table.distance.min() == pytest.approx(passage.clearance.min(), abs=1e-6)
+    backwards = measured(passage.rig, passage.scene, line[::-1])
+    assert backwards.distance.min() == pytest.approx(passage.clearance.min(), abs=1e-6)
+
+
 def test_a_slow_run_has_ten_rows_per_second(passage: Passage) -> None:
     middle = int(np.argmin(passage.clearance))
     x = passage.line[middle] + np.arange(-45.0, 45.0)[:, None] * [0.0002, 0.0, 0.0]

@@ -521,6 +521,16 @@ def test_a_camera_that_saw_the_smallest_clearance_counts_before_other_encoders(
     assert found["measured_min"] == pytest.approx(22.0)
 
 
+def test_the_noise_of_encoders_does_not_replace_a_camera_that_saw_the_smallest_clearance() -> None:
+    table = passing_a_post(0.0, np.arange(0.1, 4.0, 0.2))
+    encoders = np.array(table.source) == "encoder"
+    distance, uncertainty = table.distance.copy(), np.where(encoders, 1e-3, table.uncertainty)
+    distance[np.flatnonzero(encoders)[20]] -= 2.5e-3
+    found = _clearance(replace(table, distance=distance, uncertainty=uncertainty), 0.020)
+    assert found is not None
+    assert found["source"] == "tag"
+
+
 def test_planned_and_travelled_length_of_a_turning_path_are_of_one_measure(
     run: fake_run.FakeRun,
 ) -> None:
