@@ -90,8 +90,7 @@ def test_a_record_that_ends_in_motion_has_a_row_at_its_end(
 ) -> None:
     """As at a collision: the last tenth of a second counted only up to its beginning."""
     nearest = int(np.argmin(passage.clearance))
-    first = nearest - 20 - ends_after
-    line = passage.line[first - first % 10 : nearest + 1]
+    line = passage.line[(nearest - ends_after) % 10 : nearest + 1]
     table = measured(passage.rig, passage.scene, line)
     assert table.distance.min() == pytest.approx(passage.clearance.min(), abs=1e-6)
     backwards = measured(passage.rig, passage.scene, line[::-1])
