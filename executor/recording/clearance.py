@@ -235,9 +235,9 @@ class ClearanceRow:
 def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> list[ClearanceRow]:
     """Rows for encoder poses of a run, in order of time; none without an obstacle.
 
-    There are `RATE` per second, and one at either end of a record in motion. Between two poses the clearance changes by at most the motion of
-    the platform: where it may be below that of all rows, or below the required one, rows in the
-    middle are added until that motion is at most `STEP`.
+    There are `RATE` per second, and one at either end of a record in motion. Between two poses the
+    clearance changes by at most the motion of the platform: where it may be below that of all rows,
+    or below the required one, rows in the middle are added until that motion is at most `STEP`.
 
     Args:
         model: Robot and scene.
