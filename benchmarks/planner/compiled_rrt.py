@@ -16,7 +16,7 @@ from planner.anytime.problem import PathProblem, edge_allowed
 from planner.anytime.state import Handle
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, kernel, leaf
-from planner.kernels.primitives import State, Vector, along, minus, norm, seeded, uniform
+from planner.kernels.primitives import RandomState, Vector, along, minus, norm, seeded, uniform
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -37,7 +37,7 @@ class Trees(NamedTuple):
 
     nodes: Array
     counts: Integers
-    state: State
+    state: RandomState
 
 
 def new_trees(start: Array, goal: Array, seed: int) -> Trees:
