@@ -195,7 +195,7 @@ def no_path(
 
 
 def _rotate(scene: Scene) -> str:
-    """The way out that the proof, at the orientation of the start, leaves open."""
+    """The remedy that the proof, at the orientation of the start, leaves open."""
     limits = "" if scene.rotation_limits else "add rotation_limits to the scene and "
     return f"{limits}plan with `free_rotation=True`"
 

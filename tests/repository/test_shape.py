@@ -36,6 +36,7 @@ INNER_IMPORTS: dict[str, set[str]] = {
         "planner/workspace/figures.py",
     },
     "of several protocols, back ends or planners one is loaded": {
+        "drivers/can_bus.py",
         "drivers/factory.py",
         "drivers/stopping_distance.py",
         "executor/cameras/open.py",
