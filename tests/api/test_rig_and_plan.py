@@ -646,7 +646,7 @@ def test_a_wrong_argument_is_named_with_its_value(
         (lambda: cdpr.plan(rig, scene, seed=False), "the seed must be a whole number from 0"),
         (lambda: cdpr.workspace_map(rig, slices=("z", 0.4)), "'z' is not a slice"),
         (lambda: cdpr.workspace_map(rig, slices=[("xy", 0.1)]), "('xy', 0.1) is not a slice"),
-        (lambda: cdpr.workspace_map(rig, rotation=np.ones((3, 3))), "no rotation"),
+        (lambda: cdpr.workspace_map(rig, rotation=np.ones((3, 3))), "not a rotation"),
         (lambda: cdpr.load_rig(None), "the path must be a str or a pathlib.Path, it is None"),
         (lambda: plan.save(3), "the path must be a str or a pathlib.Path, it is 3 (int)"),
     ):

@@ -72,7 +72,7 @@ def test_a_new_file_shows_how_the_make_of_the_drives_is_named() -> None:
     document = RigDocument.model_validate({**parse_yaml(text).data, "drives": drives})
     assert document.drives == Cia402Document(type="cia402", profile="epos4")
     assert all(name in lines for name in profile_names())
-    pages = set(re.findall(r"[^ (]+\.md", text))
+    pages = set(re.findall(r"/.*?\.md", text))
     assert {Path(page).name for page in pages} == {"drives.md", "odrive.md", "rig-file.md"}
     assert all(Path(page).is_absolute() and Path(page).is_file() for page in pages)
 

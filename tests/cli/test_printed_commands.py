@@ -90,6 +90,7 @@ NOT_RUN_WITH = {
     ("home", "--as-rig-file"): "needs drives on a bus: tests/executor/test_reference.py",
     ("run", "--camera"): "needs a camera",
     ("run", "--interface"): "needs drives on a bus: tests/scenarios/test_processes.py",
+    ("sim", "--eds"): "needs a manufacturer's file",
     ("sim", "--interface"): "runs until Ctrl-C: tests/scenarios/test_processes.py",
     ("track", "--pictures"): "needs a camera",
 }

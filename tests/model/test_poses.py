@@ -62,7 +62,7 @@ def test_no_pose_has_a_matrix_that_is_no_rotation(turn: Vector, factor: float, r
     """Mirrored, stretched, flat or unknown along one axis."""
     matrix = matrix_from_rotation_vector(turn)
     matrix[row] *= factor
-    with pytest.raises(BadInput, match="no rotation"):
+    with pytest.raises(BadInput, match="not a rotation"):
         Pose(np.zeros(3), matrix)
 
 
@@ -90,7 +90,7 @@ def test_a_rotation_with_round_off_is_kept_as_it_is(turn: Vector, off: float) ->
 @given(turns, st.floats(0.0006, 3.0) | st.floats(-0.4, -0.0006))
 def test_a_quaternion_or_matrix_of_another_length_is_refused(turn: Vector, more: float) -> None:
     matrix = matrix_from_rotation_vector(turn)
-    with pytest.raises(BadInput, match="no rotation"):
+    with pytest.raises(BadInput, match="not a rotation"):
         Pose(np.zeros(3), (1.0 + more) * matrix)
     with pytest.raises(BadInput, match="not a unit quaternion"):
         Pose.from_quaternion(np.zeros(3), (1.0 + 2.0 * more) * quaternion_from_matrix(matrix))
