@@ -53,6 +53,11 @@ class KernelInterface:
     state: str
     modes: tuple[str, ...] = ()
 
+    @property
+    def hindering(self) -> dict[str, str]:
+        """Its modes in which drives cannot be commanded, each with the reason."""
+        return {mode: UNUSABLE_MODES[mode] for mode in self.modes if mode in UNUSABLE_MODES}
+
 
 def parse_interfaces(text: str) -> tuple[KernelInterface, ...]:
     """CAN interfaces in the output of ``ip -details -json link show``.
@@ -162,14 +167,13 @@ def _require_controller(found: KernelInterface, bitrate: int) -> None:
             why="it neither sends nor receives until the interface is taken down and up again",
             next_step=f"measure 60 ohm between CAN-H and CAN-L, then {again}",
         )
-    for mode, why in UNUSABLE_MODES.items():
-        if mode in found.modes:
-            raise HardwareMissing(
-                f"{found.name} is in the mode {mode}",
-                where=f"bus socketcan {found.name}",
-                why=why,
-                next_step=again,
-            )
+    for mode, why in found.hindering.items():
+        raise HardwareMissing(
+            f"{found.name} is in the mode {mode}",
+            where=f"bus socketcan {found.name}",
+            why=why,
+            next_step=again,
+        )
     if found.bitrate not in (None, bitrate):
         raise HardwareMissing(
             f"{found.name} runs at {found.bitrate} bit/s; the rig file states {bitrate}",
@@ -183,7 +187,7 @@ def _require_controller(found: KernelInterface, bitrate: int) -> None:
 def set_up_again(found: KernelInterface, bitrate: int) -> str:
     """The command that sets the bit rate and ends modes that hinder, possible only while down."""
     name = found.name
-    ended = "".join(f" {mode.lower()} off" for mode in found.modes if mode in UNUSABLE_MODES)
+    ended = "".join(f" {mode.lower()} off" for mode in found.hindering)
     return (
         f"sudo ip link set {name} down && sudo ip link set {name} up txqueuelen 128"
         f" type can bitrate {bitrate}{ended}"

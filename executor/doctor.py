@@ -24,7 +24,6 @@ from typing import TYPE_CHECKING
 
 from drivers.can_interfaces import (
     MIN_TRANSMIT_QUEUE,
-    UNUSABLE_MODES,
     KernelInterface,
     bring_up,
     can_interfaces,
@@ -330,10 +329,9 @@ def _controller(found: KernelInterface, again: str) -> MachineCheck:
     healthy = not found.state or found.state in HEALTHY
     fix = f"check power, cable and termination (60 ohm), then {again}"
     text = found.state or "not stated by its driver"
-    hindering = [mode for mode in found.modes if mode in UNUSABLE_MODES]
-    if hindering:
-        why = "; ".join(UNUSABLE_MODES[mode] for mode in hindering)
-        text, healthy, fix = f"{text}, {', '.join(hindering)}: {why}", False, again
+    if found.hindering:
+        why = "; ".join(found.hindering.values())
+        text, healthy, fix = f"{text}, {', '.join(found.hindering)}: {why}", False, again
     elif not found.up:
         healthy = True  # it has no state to report; `_up` reports that
     return MachineCheck(f"controller of {found.name}", healthy, text, fix)

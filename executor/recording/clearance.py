@@ -246,13 +246,13 @@ def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> 
     """
     known = np.flatnonzero(cycles.has_encoder_pose)
     every = max(1, round(1.0 / (RATE * model.rig.cycle)))
-    more = np.flatnonzero(known % every == 0)
-    if not (model.obstacle_names and more.size):
+    regular = np.flatnonzero(known % every == 0)
+    if not (model.obstacle_names and regular.size):
         return []
     motion, noise = _motion(model.rig, cycles, known), tension_noise(model.rig, cycles.tensions)
-    ends = [(0, more[0]), (known.size - 1, more[-1])]  # of a record that ends in motion
-    more = np.union1d(more, [k for k, row in ends if abs(motion[k] - motion[row]) > STEP])
-    more = more.astype(np.int64)
+    ends = np.array([0, known.size - 1])  # counted where the record begins or ends in motion
+    in_motion = np.abs(motion[ends] - motion[regular[[0, -1]]]) > STEP
+    more = np.union1d(regular, ends[in_motion])
     rows: dict[int, ClearanceRow] = {}
     while more.size:
         rows |= zip(more.tolist(), _rows_at(model, cycles, known[more], noise), strict=True)

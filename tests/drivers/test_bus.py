@@ -86,6 +86,17 @@ def test_a_missing_kernel_interface_says_how_to_bring_it_up() -> None:
     assert "bitrate 500000" in caught.value.next_step
 
 
+def set_up_can0(
+    root: Path, monkeypatch: pytest.MonkeyPatch, flags: str = "0x40081", queue: int = 128
+) -> None:
+    """The kernel's files of an interface that is up, unless stated otherwise."""
+    folder = root / "can0"
+    folder.mkdir()
+    (folder / "flags").write_text(f"{flags}\n")
+    (folder / "tx_queue_len").write_text(f"{queue}\n")
+    monkeypatch.setattr(can_interfaces, "INTERFACES", root)
+
+
 @pytest.mark.parametrize(
     ("flags", "queue", "what"),
     [("0x40080", 128, "down"), ("0x40081", 10, "transmit queue")],
@@ -93,11 +104,7 @@ def test_a_missing_kernel_interface_says_how_to_bring_it_up() -> None:
 def test_a_kernel_interface_that_is_down_or_short_of_queue_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: str, queue: int, what: str
 ) -> None:
-    folder = tmp_path / "can0"
-    folder.mkdir()
-    (folder / "flags").write_text(f"{flags}\n")
-    (folder / "tx_queue_len").write_text(f"{queue}\n")
-    monkeypatch.setattr(can_interfaces, "INTERFACES", tmp_path)
+    set_up_can0(tmp_path, monkeypatch, flags, queue)
     with pytest.raises(HardwareMissing) as caught:
         open_bus(BusSettings("socketcan", "can0"))
     assert what in caught.value.what
@@ -109,11 +116,7 @@ def test_a_kernel_interface_at_another_bit_rate_is_not_opened(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: int | None, refused: bool
 ) -> None:
     """The load of its bus would be twice the one that was checked; a serial adapter states none."""
-    folder = tmp_path / "can0"
-    folder.mkdir()
-    (folder / "flags").write_text("0x40081\n")
-    (folder / "tx_queue_len").write_text("128\n")
-    monkeypatch.setattr(can_interfaces, "INTERFACES", tmp_path)
+    set_up_can0(tmp_path, monkeypatch)
     found = (
         KernelInterface("can1", "can", True, 128, 125_000, ""),
         KernelInterface("can0", "can", True, 128, rate, ""),
@@ -155,11 +158,7 @@ def test_a_controller_that_cannot_command_drives_is_not_opened(
     what: str,
 ) -> None:
     """It is up, and every frame is lost: the drives were said to have no power."""
-    folder = tmp_path / "can0"
-    folder.mkdir()
-    (folder / "flags").write_text("0x40081\n")
-    (folder / "tx_queue_len").write_text("128\n")
-    monkeypatch.setattr(can_interfaces, "INTERFACES", tmp_path)
+    set_up_can0(tmp_path, monkeypatch)
     monkeypatch.setattr(can, "Bus", lambda **_options: InProcessBus("ready"))
     found = KernelInterface("can0", "can", True, 128, 1_000_000, state, modes)
     monkeypatch.setattr(can_interfaces, "can_interfaces", lambda: (found,))
