@@ -28,6 +28,10 @@ MISSED_TORQUES = 3
 """Further cycles without a torque that are a fault; `executor.safety.monitor` judges missing
 positions."""
 
+TORQUE_AFTER = 2
+"""Cycles after which a torque is younger than the heartbeat that showed its drive under torque: the
+drive measures and sends it by its own clock, and a cycle may end between two of its messages."""
+
 NEVER = 10**6
 
 Report = Literal["heartbeat", "position", "torque"]
@@ -86,6 +90,7 @@ class OdriveMonitor:
             "torque": math.ceil(document.torques_ms / cycle_ms) + SPARE_CYCLES,
         }
         self._ages = {report: [NEVER] * count for report in self._most}
+        self._under_torque = [0] * count  # cycles since each drive was seen so
         self._not_numbers: set[tuple[Report, int]] = set()
         self._routes: dict[int, tuple[int, Layout, Callable[[int, tuple[float, ...]], None]]] = {}
         for drive, node in enumerate(self.nodes):
@@ -117,6 +122,12 @@ class OdriveMonitor:
         return self.overdue("position")
 
     @property
+    def measures_tensions(self) -> bool:
+        """Whether every axis follows set-points and has sent a torque since."""
+        ages = zip(self._ages["torque"], self._under_torque, strict=True)
+        return all(age + TORQUE_AFTER <= cycles for age, cycles in ages)
+
+    @property
     def status_words(self) -> list[int]:
         """The state of each axis as one number (`status_word`)."""
         return [status_word(s, e) for s, e in zip(self.states, self.errors, strict=True)]
@@ -131,6 +142,9 @@ class OdriveMonitor:
         self._check.end_cycle()
         for ages in self._ages.values():
             ages[:] = [age + 1 for age in ages]
+        for drive, state in enumerate(self.states):
+            enabled = state == AxisState.CLOSED_LOOP_CONTROL
+            self._under_torque[drive] = self._under_torque[drive] + 1 if enabled else 0
 
     def forget(self, report: Report) -> None:
         """Ignores the reports so far; any next position counts, as the drives may have moved."""

@@ -262,6 +262,31 @@ def test_messages_at_other_periods_than_the_cycle_are_not_missing() -> None:
             assert status.state is GroupState.ENABLED, status.faults
 
 
+@pytest.mark.parametrize("torques_ms", [5, 10, 30, 50])
+@pytest.mark.parametrize("heartbeat_ms", [20, 50])
+def test_the_first_tensions_of_enabled_drives_were_sent_under_torque(
+    torques_ms: int, heartbeat_ms: int
+) -> None:
+    """The last torque of an idle drive, 0, was a slack cable, and a good run failed."""
+    with odrive_bench(odrive_rig(torques_ms=torques_ms, heartbeat_ms=heartbeat_ms)) as bench:
+        status = bench.enable()
+        assert status.state is GroupState.ENABLED, status.faults
+        tensions = bench.rig.tensions_by(status.torques)
+        assert tensions == pytest.approx(bench.rehearsal.tensions, abs=0.1)
+
+
+def test_a_drive_that_sends_no_torque_once_enabled_is_a_fault(bench: OdriveBench) -> None:
+    bench.group.configure()
+    bench.group.read_positions()
+    bench.group.command(GroupCommand.ENABLE)
+    bench.cycle()
+    bench.drives[4].silent.add("torques")
+    for _ in range(8):
+        status = bench.cycle()
+        assert status.state is not GroupState.ENABLED
+    assert status.faults == ((5, "cable 5 (drive 5) does not report its torque"),)
+
+
 @pytest.mark.parametrize("key", ["estimates_ms", "torques_ms"])
 def test_reports_too_rare_to_see_a_fault_in_time_are_refused(key: str) -> None:
     """Positions are compared with all set-points of a period: a jammed drive may be any of them."""
