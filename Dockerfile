@@ -6,7 +6,8 @@
 #   docker run --rm -v "$PWD/out:/opt/cdpr/runs" cdpr    # keeps the report; `out` must be writable for user 1000
 #
 # For drives on a CAN interface of the host it needs more: --network host, --cap-add SYS_NICE, --ulimit rtprio=80,
-# --ulimit memlock=-1, and a folder /var/lib/cdpr mounted from the host, where the fault latch outlives the container.
+# --ulimit memlock=-1, on a host with cgroup v1 and RT_GROUP_SCHED also --cpu-rt-runtime=950000 (of dockerd, too), and a
+# folder /var/lib/cdpr mounted from the host, where the fault latch outlives the container.
 FROM python:3.12-slim
 
 RUN apt-get update \

@@ -30,7 +30,14 @@ from drivers.can_interfaces import (
     set_up_again,
 )
 from executor.cameras.sources import parse_camera_sources
-from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, PRIORITY, has_capability
+from executor.realtime.scheduling import (
+    ALLOW_GROUP,
+    CAP_IPC_LOCK,
+    PRIORITY,
+    has_capability,
+    is_granted_priority,
+    priority_limit,
+)
 from model.errors import BadInput, CdprError, InvalidFile, without_passwords
 from model.rig import Camera, Rig
 
@@ -342,22 +349,24 @@ def _controller(found: KernelInterface, again: str) -> MachineCheck:
 
 def real_time_permission() -> list[MachineCheck]:
     """Priority and locked memory, as `cdpr run` requests them for real drives."""
-    priority = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
     locked = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     return [
-        priority_check(priority, PRIORITY, privileged=has_capability(CAP_SYS_NICE)),
+        priority_check(priority_limit(), granted=is_granted_priority()),
         memory_check(locked, privileged=has_capability(CAP_IPC_LOCK)),
     ]
 
 
-def priority_check(limit: int, wanted: int, *, privileged: bool) -> MachineCheck:
-    """Whether the loop may take its real-time priority (RLIMIT_RTPRIO)."""
-    unlimited = limit == resource.RLIM_INFINITY
-    text = "allowed" if privileged else f"up to {'any' if unlimited else limit}"
-    good = privileged or unlimited or limit >= wanted
-    return MachineCheck(
-        "real-time priority", good, f"{text}; {wanted} is used", _allow("rtprio", wanted)
-    )
+def priority_check(limit: float, *, granted: bool) -> MachineCheck:
+    """Whether the loop gets its real-time priority, which a control group may deny.
+
+    Args:
+        limit: Highest priority that the user may have (RLIMIT_RTPRIO).
+        granted: Whether the system granted it.
+    """
+    text, fix = f"up to {limit:g}", _allow("rtprio", PRIORITY)
+    if limit >= PRIORITY:
+        text, fix = "allowed" if granted else "allowed to the user, but denied", ALLOW_GROUP
+    return MachineCheck("real-time priority", granted, f"{text}; {PRIORITY} is used", fix)
 
 
 def memory_check(limit: int, *, privileged: bool) -> MachineCheck:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import gc
+import math
 import os
 import resource
 import signal
@@ -13,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from multiprocessing import current_process, resource_tracker
 from multiprocessing.process import BaseProcess
@@ -196,6 +198,35 @@ def has_capability(number: int) -> bool:
     return bool(int(granted, 16) >> number & 1)
 
 
+#: How to allow real-time scheduling that the user may have, but the system still denies.
+ALLOW_GROUP = (
+    "give this program's control group real-time run time, by `docker run --cpu-rt-runtime=950000`"
+    " or in `cpu.rt_runtime_us`, or remove `RestrictRealtime=` from its systemd service"
+)
+
+
+def priority_limit() -> float:
+    """Highest real-time priority that this user may have; infinite without a limit."""
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    unlimited = has_capability(CAP_SYS_NICE) or limit == resource.RLIM_INFINITY
+    return math.inf if unlimited else limit
+
+
+def is_granted_priority() -> bool:
+    """Whether the system grants `PRIORITY`, tried in a thread of its own."""
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(_take_priority).result()
+
+
+def _take_priority() -> bool:
+    """Takes the priority for the calling thread; False if it was denied."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except PermissionError:
+        return False
+    return True
+
+
 @contextmanager
 def real_time() -> Iterator[str]:
     """Runs the block with SCHED_FIFO, memory locked and garbage collection off.
@@ -219,10 +250,10 @@ def real_time() -> Iterator[str]:
 
 def _enter() -> str:
     denied = []
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    except PermissionError:
-        denied.append("real-time scheduling (allow it with `ulimit -r 50` or CAP_SYS_NICE)")
+    if not _take_priority():
+        by_user = f"allow it with `ulimit -r {PRIORITY}` or CAP_SYS_NICE"
+        how = by_user if priority_limit() < PRIORITY else ALLOW_GROUP
+        denied.append(f"real-time scheduling ({how})")
     if not _lock_memory():
         denied.append("locked memory (allow it with `ulimit -l unlimited` or CAP_IPC_LOCK)")
     return f"denied: {', '.join(denied)}; cycles may be late" if denied else ""

@@ -29,12 +29,13 @@ from executor.doctor import (
     MachineCheck,
     kernel_bus,
     memory_check,
-    priority_check,
+    real_time_permission,
     rig_bus,
     stopping_text,
 )
 from executor.interlock import locks
 from executor.interlock.locks import SetUpLock
+from executor.realtime import scheduling
 from executor.recording.summary import versions
 from model.errors import HardwareMissing
 from model.rig import load_rig, rig_from_document
@@ -204,13 +205,47 @@ def test_unexpected_output_of_ip_is_reported(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("limit", "privileged", "good"),
-    [(0, False, False), (49, False, False), (50, False, True), (0, True, True)],
+    ("limit", "privileged", "granted", "fix", "denied"),
+    [
+        (0, False, False, "rtprio 50' | sudo tee -a /etc/security/limits.d", "`ulimit -r 50`"),
+        (49, False, False, "rtprio 50' | sudo tee -a /etc/security/limits.d", "`ulimit -r 50`"),
+        (50, False, True, "", ""),
+        (0, True, True, "", ""),
+        (resource.RLIM_INFINITY, False, True, "", ""),
+        (50, False, False, "`docker run --cpu-rt-runtime=950000`", "`cpu.rt_runtime_us`"),
+        (0, True, False, "`RestrictRealtime=`", "`RestrictRealtime=`"),
+    ],
 )
-def test_real_time_priority(limit: int, privileged: bool, good: bool) -> None:
-    answer = priority_check(limit, 50, privileged=privileged)
-    assert answer.good is good
-    assert "rtprio 50' | sudo tee -a /etc/security/limits.d/cdpr.conf" in answer.fix
+def test_real_time_priority(
+    limit: int,
+    privileged: bool,
+    granted: bool,
+    fix: str,
+    denied: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Limit or capability allow it, and the control group may still deny it: it is tried."""
+
+    def take(*_: object) -> None:
+        if not granted:
+            raise PermissionError
+
+    monkeypatch.setattr("resource.getrlimit", lambda _: (limit, limit))
+    monkeypatch.setattr("os.sched_setscheduler", take)
+    monkeypatch.setattr(scheduling, "has_capability", lambda _: privileged)
+    monkeypatch.setattr(scheduling, "_lock_memory", lambda: True)
+    answer, _ = real_time_permission()
+    assert answer.good is granted
+    assert fix in answer.fix
+    with scheduling.real_time() as found:
+        assert bool(found) is not granted
+        assert denied in found
+
+
+def test_the_priority_is_tried_in_another_thread() -> None:
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    real_time_permission()
+    assert (os.sched_getscheduler(0), os.sched_getparam(0)) == before
 
 
 @pytest.mark.parametrize(
