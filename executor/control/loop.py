@@ -359,7 +359,7 @@ class Loop:
 
     def _fault(self, code: str, text: str) -> None:
         """Quick stop for all drives at once, latched; the cause keeps a path fault before it."""
-        text = f"{text}; quick stop of all drives, fault latched"
+        text = f"{text}; quick stop of all drives"
         if self.machine.state is not State.LATCHED and self.cause not in ("", self._requested):
             unfinished = f"; {self._path_stop}" if self.machine.state in ON_PATH else ""
             self.cause = f"{self.cause.removesuffix(unfinished)}; then {text}"

@@ -354,7 +354,7 @@ def test_a_fault_during_a_path_stop_is_named_after_the_first_cause(
     first, _, second = outcome.cause.partition("; then ")
     assert first == "a cycle began 1.4 cycles late"
     assert second.startswith("cable 6 (drive 6)")
-    assert second.endswith("; quick stop of all drives, fault latched")
+    assert second.endswith("; quick stop of all drives")
     assert codes.index("late") < codes.index("drive_fault")
 
 
