@@ -97,7 +97,7 @@ def test_a_plan_is_run_on_odrives_from_the_rig_file_alone(plan: Path, tmp_path: 
 
 def test_a_jog_with_rare_torques_passes(tmp_path: Path) -> None:
     rig, run = changed_rig(tmp_path, torques_ms=50), tmp_path / "jog"
-    answer = call("jog", rig, "--by-mm", 0, 0, -2, "--no-scene", "--fast", "-o", run)
+    answer = call("jog", rig, "--by-mm", "0", "0", "-2", "--no-scene", "--fast", "-o", run)
     assert answer.code == 0, answer
     cycles = RunFolder(run).cycles()
     assert np.nanmin(cycles.tensions) > load_rig(rig).min_tension
