@@ -295,9 +295,9 @@ class SimulatedRig(ABC, Generic[Drive]):
             drive.advance(elapsed)
 
     def _begin_torque_update(self) -> None:
-        """Begins an update of the torques, unless one is in progress."""
+        """Begins an update to the present positions, unless one is in progress."""
         if self._update is None:
-            self._update = self._updating()
+            self._update = self._updating(self._positions())
 
     def _continue_torque_update(self, update: Iterator[None]) -> None:
         """Makes one step of the update in progress.
@@ -326,9 +326,12 @@ class SimulatedRig(ABC, Generic[Drive]):
             self.plant.settle_counts(self._transmission.drums(counts))
             self._counts = counts
 
-    def _updating(self) -> Iterator[None]:
-        """Moves the platform to its equilibrium, then sets the torques."""
-        counts = self._positions()
+    def _updating(self, counts: Array) -> Iterator[None]:
+        """Moves the platform to its equilibrium, then sets the torques.
+
+        Args:
+            counts: Positions of the motors, shape (m,), [counts].
+        """
         if not np.array_equal(counts, self._counts):
             yield from self.plant.settling_counts(self._transmission.drums(counts))
             if self._friction_torque > 0.0:  # a motor at rest keeps its last friction torque

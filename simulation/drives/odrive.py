@@ -51,6 +51,11 @@ SUCCESS, DISARMED, NOT_CALIBRATED = 0, 3, 14
 SUPPLY = 48.0
 """[V]."""
 
+SETTLED = 0.25
+"""Part of a cycle without a set-point after which all drives have received theirs."""
+LONGEST_WAIT = 2.0
+"""Cycles after which torques are updated although set-points never pause."""
+
 
 @dataclass(slots=True)
 class OdriveSettings:
@@ -290,7 +295,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
             raise TypeError("the rig has no ODrives")
         self._document = document
         self._layouts = read_layouts(document.dbc)
-        self._since_update = 0.0
+        self._since_update = self._since_set_point = 0.0
         # Drives that report more often than once a cycle do so at different positions.
         self._steps = max(1, math.ceil(rig.document.bus.cycle_ms / document.estimates_ms))
         super().__init__(rig, bus, start_pose, load)
@@ -325,10 +330,17 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         self._finish_torque_update()
 
     def _advance(self, elapsed: float) -> None:
-        """Updates the torques only once per cycle, as finding the equilibrium is slow."""
+        """Updates the torques only once per cycle, as finding the equilibrium is slow.
+
+        The platform's inertia averages over the milliseconds in which some drives have received the
+        set-point of a cycle and others have not; the equilibrium of such positions is not reached.
+        """
         super()._advance(elapsed)
         self._since_update += elapsed
-        if self._since_update >= self._cycle - 1e-9:
+        self._since_set_point += elapsed
+        is_between_cycles = self._since_set_point >= SETTLED * self._cycle
+        due = self._cycle if is_between_cycles else LONGEST_WAIT * self._cycle
+        if self._since_update >= due - 1e-9:
             self._since_update = 0.0
             self.cycles += 1
             self._begin_torque_update()
@@ -341,6 +353,8 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
             addressed = self.drives
         else:
             addressed = (self._by_node[node],) if node in self._by_node else ()
+        if command == self._layouts.set_input_pos.command:
+            self._since_set_point = 0.0
         for drive in addressed:
             drive.receive(command, message.data)
 

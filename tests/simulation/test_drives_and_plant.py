@@ -22,7 +22,9 @@ from model.rig import Rig, rig_from_document
 from model.statics.gravity import working_tensions
 from simulation.drives.behaviour import behaviour_named
 from simulation.drives.cia402_rig import SimulatedCia402Rig
+from simulation.drives.odrive import SimulatedOdriveRig
 from simulation.rig import RehearsalStatus
+from tests.drivers.odrive_bench import odrive_bench, odrive_rig
 
 _CHANNELS = itertools.count()
 
@@ -32,7 +34,9 @@ def channel() -> BusSettings:
     return BusSettings("virtual", f"rehearsal-{next(_CHANNELS)}")
 
 
-def targets_for(robot: Rig, rehearsal: SimulatedCia402Rig, pose: Pose) -> list[int]:
+def targets_for(
+    robot: Rig, rehearsal: SimulatedCia402Rig | SimulatedOdriveRig, pose: Pose
+) -> list[int]:
     winch_map = rehearsal.plant.winch_map
     tensions = working_tensions(robot, pose).tensions
     unstrained = winch_map.unstrained(cable_lengths(robot, pose), tensions)
@@ -197,6 +201,28 @@ def test_serving_ends_quietly_on_an_interrupt_from_the_keyboard(
 
     with open_bus(channel) as bus:
         SimulatedCia402Rig(rig, bus, rig.home).serve(threading.Event().is_set, clock=interrupted)
+
+
+def test_set_points_that_come_one_by_one_never_leave_the_platform_between_two_cycles(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Eight ODrives receive those of a cycle within a millisecond; inertia averages over it."""
+    stop, statuses = threading.Event(), list[RehearsalStatus]()
+    with odrive_bench(odrive_rig()) as bench:
+        bench.enable()
+        rig, rehearsal = bench.rig, bench.rehearsal
+        arrivals: list[can.Message | None] = []
+        for pose in circle(rig, 100):
+            bench.group.send_cycle(targets_for(rig, rehearsal, pose))
+            for frame in bench.frames():
+                arrivals += [frame, None]
+            arrivals += [None] * 8
+        coming = iter(arrivals)
+        monkeypatch.setattr("simulation.rig.receive_frame", lambda *_: next(coming, None))
+        clock = ManualTime(stop, readings=3 * len(arrivals), step=0.0004)
+        rehearsal.serve(stop.is_set, statuses.append, status_period=0.0, clock=clock)
+    tensions = np.array([status.tensions for status in statuses])
+    assert np.abs(np.diff(tensions, axis=0)).max() < 5.0
 
 
 def test_no_set_up_makes_a_drive_that_monitors_its_limits_release_its_cable(
