@@ -209,6 +209,20 @@ def interpolation_time(
     )
 
 
+def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
+    """Deceleration that stops a drive from top speed within a cycle, in the drive's unit."""
+    winch = rig.winches[drive]
+    ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
+    turns = ramp / winch.counts_per_turn
+    in_unit = {"counts/s^2": ramp, "rpm/s": 60.0 * turns, "rev/s^2": turns}
+    return in_unit[profile.acceleration_unit] / profile.acceleration_step
+
+
+def quick_stop_time(ramp: float, allowed: Range, cycle: float) -> float:
+    """Time of a quick stop from top speed, [s]: ``ramp`` would take a cycle, the drive may not."""
+    return cycle * max(1.0, ramp / max(1, allowed.high))
+
+
 # What to do about an object that a drive does not have.
 
 SUPPORTED_MODES = 0x6502
