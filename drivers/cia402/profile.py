@@ -228,8 +228,7 @@ def quick_stop_time(ramp: float, allowed: Range, cycle: float) -> float:
 SUPPORTED_MODES = 0x6502
 HOW_UNLISTED = "for a drive that has it unlisted, set csp_unlisted: true in its profile"
 HOW_WITHOUT_CSP = (
-    "use another drive if it has no cyclic synchronous position (CSP), as Technosoft iPOS and Pilz"
-    f" PRBT; {HOW_UNLISTED}"
+    f"use another drive if it has no cyclic synchronous position (CSP); {HOW_UNLISTED}"
 )
 
 _BESIDE = {

@@ -1187,6 +1187,18 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     assert "no profile" in change["6007h:00"]
 
 
+def test_the_texts_on_supported_modes_name_no_make(rig: Rig) -> None:
+    """Technosoft iPOS has CSP since 2017: manual P091.063.iPOS.STO.UM.0117, section 10."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x6502, 0] = 0x65
+    (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("6502h"))
+    for text in (row.meaning, row.change):
+        assert "Technosoft" not in text
+        assert "Pilz" not in text
+        assert "csp_unlisted: true" in text
+
+
 def test_doctor_names_the_keys_for_process_data_that_cannot_be_mapped(rig: Rig) -> None:
     """A PDO1 with the fixed mapping of CiA 402; "no profile can replace it" was said of it."""
     bus = eight_of("cia402")
@@ -1397,13 +1409,6 @@ def test_a_current_limit_of_16_bits_is_set(rig: Rig, tmp_path: Path, keys: str, 
     assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
 
 
-def test_a_current_limit_of_another_size_names_the_key_for_it(rig: Rig, tmp_path: Path) -> None:
-    line = 'torque_limit: {object: "6073h:00", rated: "6075h:00"}\nabsent: ["6072h:00"]'
-    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
-    with_max_current(bus)
-    (row,) = [row for row in examined(theirs, bus).rows if row.verdict == "wrong"]
-    assert row.object.startswith("6073h:00")
-    assert row.change == "profile: `bytes` of torque_limit"
 @pytest.mark.parametrize(("rated", "limit"), [("819", 983), ("0.5", 1), ("54000", 64800)])
 def test_a_current_limit_in_a_unit_that_no_object_states_is_set(
     rig: Rig, tmp_path: Path, rated: str, limit: int
@@ -1419,3 +1424,10 @@ def test_a_current_limit_in_a_unit_that_no_object_states_is_set(
     assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
 
 
+def test_a_current_limit_of_another_size_names_the_key_for_it(rig: Rig, tmp_path: Path) -> None:
+    line = 'torque_limit: {object: "6073h:00", rated: "6075h:00"}\nabsent: ["6072h:00"]'
+    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
+    with_max_current(bus)
+    (row,) = [row for row in examined(theirs, bus).rows if row.verdict == "wrong"]
+    assert row.object.startswith("6073h:00")
+    assert row.change == "profile: `bytes` of torque_limit"
