@@ -1187,6 +1187,52 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     assert "no profile" in change["6007h:00"]
 
 
+UNMONITORED = "use another drive: nothing stops this one when the master is lost"
+
+
+@pytest.mark.parametrize(
+    ("lines", "absent"),
+    [
+        ("", ["1006h:00", "1016h:00"]),
+        ("monitoring: heartbeat", ["1006h:00", "1016h:00"]),
+        ('absent: ["1006h:00"]\nmonitoring: heartbeat', ["1016h:00"]),
+        ('absent: ["1016h:01"]', ["1006h:00"]),
+        ("heartbeat_loss: fault", ["1006h:00"]),
+    ],
+)
+def test_doctor_sees_that_nothing_would_stop_a_drive_without_its_master(
+    rig: Rig, tmp_path: Path, lines: str, absent: list[str]
+) -> None:
+    """Each line named the other object as the solution; both absent were refused."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.aborts |= dict.fromkeys([(0x1006, 0), (0x1016, 0), (0x1016, 1)], 0x06020000)
+    rows = examined(with_profile(rig, lab_profile(tmp_path, lines)), bus).rows
+    wrong = {row.object[:8]: row.change for row in rows if row.verdict == "wrong"}
+    assert wrong == dict.fromkeys(absent, UNMONITORED)
+
+
+@pytest.mark.parametrize(
+    ("missing", "step"),
+    [
+        (0x1006, "list it as absent in your own drive profile, with monitoring: heartbeat"),
+        (0x1016, "list it as absent in your own drive profile, with monitoring: sync"),
+    ],
+    ids=["1006h", "1016h"],
+)
+@pytest.mark.parametrize("other", [None, 0x08000022], ids=["present", "not now"])
+def test_doctor_names_the_other_object_that_stops_a_drive(
+    rig: Rig, missing: int, step: str, other: int | None
+) -> None:
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.aborts[missing, 0] = 0x06020000
+        if other is not None:
+            drive.aborts[0x1006 if missing == 0x1016 else 0x1016, 0] = other
+    change = {row.object[:8]: row.change for row in examined(rig, bus).rows}
+    assert change[f"{missing:04X}h:00"].startswith(step)
+
+
 def test_the_texts_on_supported_modes_name_no_make(rig: Rig) -> None:
     """Technosoft iPOS has CSP since 2017: manual P091.063.iPOS.STO.UM.0117, section 10."""
     bus = eight_of("cia402")
