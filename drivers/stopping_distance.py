@@ -62,8 +62,8 @@ def lost_master(rig: Rig) -> LostMaster:
 
 def _cia402_times(rig: Rig) -> tuple[str, float, float]:
     """Missing message, time until the last CiA 402 drive notices, and its ramp, [s]."""
-    from drivers.cia402.object_dictionary import QUICK_STOP_RAMP, quick_stop_ramp, quick_stop_time
-    from drivers.cia402.profile import profile_of
+    from drivers.cia402.object_dictionary import QUICK_STOP_RAMP
+    from drivers.cia402.profile import profile_of, quick_stop_ramp, quick_stop_time
 
     cycle, profile = rig.cycle, profile_of(rig)
     allowed = profile.range_of(QUICK_STOP_RAMP, 0)

@@ -124,4 +124,5 @@ def _show_table(found: Examined, rig: Rig) -> None:
     )
     if found.missing is not None:
         show_line(f"error: {found.missing}", err)
-    show_line(stopping_text(rig))
+    if found.watches_master:
+        show_line(stopping_text(rig))

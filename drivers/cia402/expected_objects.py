@@ -45,8 +45,7 @@ class Expectation:
 
 _CSP_LISTED = Expectation(
     *(SUPPORTED_MODES, 0, 0x80, 0x80, "supported drive modes"),
-    "bit 7 is cyclic synchronous position (CSP); Technosoft iPOS and Pilz PRBT do not have it;"
-    f" {HOW_UNLISTED}",
+    f"bit 7 is cyclic synchronous position (CSP); {HOW_UNLISTED}",
 )
 _BEFORE = (
     Expectation(0x1000, 0, 0xFFFF, 402, "device type", "only CiA 402 drives are supported"),

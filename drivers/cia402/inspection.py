@@ -122,6 +122,12 @@ class Examined:
         """Whether every drive can be configured, as far as reading shows."""
         return not self.silent and all(row.verdict != "wrong" for row in self.rows)
 
+    @property
+    def watches_master(self) -> bool:
+        """Whether the drives have what the profile says that they stop by without a master."""
+        watched = (row for row in self.rows if row.object[:5] in ("1006h", "1016h"))
+        return all(row.verdict != "wrong" for row in watched)
+
     def as_dict(self) -> dict[str, Any]:
         """For `--json`."""
         return {
@@ -133,9 +139,7 @@ class Examined:
                     "object": row.object,
                     "verdict": row.verdict,
                     "needed": row.needed,
-                    "found": [
-                        {"drives": nodes, "value": text} for text, nodes in row.found.items()
-                    ],
+                    "found": [{"drives": each, "value": text} for text, each in row.found.items()],
                     "meaning": row.meaning,
                     "change": row.change,
                 }
@@ -249,26 +253,20 @@ class _Reader:
 
     def at_heartbeats(self, drives: int) -> None:
         """Number of heartbeat producers that the drive can monitor."""
-        name, needed = "consumer heartbeat entries", f"1; {drives} to monitor every peer as well"
-        used = self._profile.watches_heartbeats
-        row = self._row(
-            HEARTBEAT_CONSUMERS, 0, f"1016h:00 {name}", needed if used else "any, not used"
-        )
-        row.meaning = (
-            "stop when the master or a peer is lost"
-            if used
-            else "a lost heartbeat would remove the torque"
-        )
+        needed, meaning = "any, not used", "a lost heartbeat would remove the torque"
+        if used := self._profile.watches_heartbeats:
+            needed = f"1; {drives} to monitor every peer as well"
+            meaning = "stop when the master or a peer is lost"
+        row = self._row(HEARTBEAT_CONSUMERS, 0, "1016h:00 consumer heartbeat entries", needed)
+        row.meaning = meaning
         data = self._read(HEARTBEAT_CONSUMERS, 0, row, optional=not used, size=1)
         if data is None:
             return
         count = int.from_bytes(data, "little")
-        if not used:
-            row.note(self._node, str(count))
-        elif count < 1:
+        if used and count < 1:
             change = "a drive that cannot monitor its master is not safe to run"
             row.note(self._node, "0", "wrong", change)
-        elif self._profile.usable_heartbeats(count) < drives:
+        elif used and self._profile.usable_heartbeats(count) < drives:
             row.note(self._node, str(count), "remark", "none required: not every peer is monitored")
         else:
             row.note(self._node, str(count))
@@ -378,7 +376,8 @@ class _Reader:
             good = absent and not instead
             row.note(self._node, text, "ok" if good else "remark", instead or "none required")
         else:
-            row.note(self._node, text, "wrong", how_without(self._profile, index, sub))
+            how = how_without(self._profile, index, sub, self._client.read_if_there)
+            row.note(self._node, text, "wrong", how)
         return None
 
 

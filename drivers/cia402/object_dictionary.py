@@ -8,11 +8,17 @@ from dataclasses import dataclass, replace
 
 from drivers.can_load import HEARTBEATS_WAITED, heartbeat_cycles, heartbeat_timeout
 from drivers.cia402.pdo import MASTER_NODE, RPDO1_BASE, TPDO1_BASE
-from drivers.cia402.profile import interpolation_time, profile_of, used_pdos
+from drivers.cia402.profile import (
+    interpolation_time,
+    profile_of,
+    quick_stop_ramp,
+    quick_stop_time,
+    used_pdos,
+)
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.plausibility import position_limits
 from model.errors import BadInput
-from model.files.drive_profile_file import ProfileDocument, Range, object_key
+from model.files.drive_profile_file import ProfileDocument, object_key
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -101,8 +107,8 @@ class Setting:
         is_near = self.rounded and LOWEST * self.value <= found <= HIGHEST * self.value
         return found in self.equivalent or is_near or data == self.data()
 
-    def of_rated(self, rated: int) -> Setting:
-        """The setting with its value in the unit of ``per_mille_of``, whose value is ``rated``."""
+    def of_rated(self, rated: float) -> Setting:
+        """The setting in the unit of ``rated``, the value at rated torque, not in per mille."""
         return replace(self, value=math.ceil(self.value * rated / 1000.0), per_mille_of=None)
 
     def text(self, value: int) -> str:
@@ -171,7 +177,7 @@ def _all_settings(
     tension = rig.max_tension if max_tension is None else max_tension
     return (
         *_process_data(rig.winches[drive].node_id, profile),
-        *_supervision(cycle, profile.monitoring == "sync", _produced_ms(cycle, profile)),
+        *_supervision(cycle, profile),
         *_mode(cycle, profile),
         *_reactions(rig, drive, cycle, profile),
         *_limits(rig, drive, winch_map, tension, profile),
@@ -180,7 +186,7 @@ def _all_settings(
 
 def left_out(profile: ProfileDocument) -> tuple[str, ...]:
     """One remark for each optional object that drives of a profile lack."""
-    all_optional = (*_process_data(1, profile), *_supervision(0.01, True, 30), *_options())
+    all_optional = (*_process_data(1, profile), *_supervision(0.01, profile), *_options())
     return tuple(
         f"there is no {setting}: {setting.instead}"
         for setting in all_optional
@@ -305,9 +311,13 @@ def _mapped(parameters: int, identifier: int, objects: tuple[int, ...]) -> tuple
     )
 
 
-def _supervision(cycle: float, sync: bool, produced_ms: int) -> tuple[Setting, ...]:
-    period_us = round(1e6 * cycle) if sync else 0
-    why = "the cycle of the rig" if sync else "unused: the heartbeat stops the drive"
+def _supervision(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
+    period_us, why = round(1e6 * cycle), "the cycle of the rig"
+    if profile.monitoring == "heartbeat" and profile.communication_cycle_period:
+        why = "the drive synchronises to it; the heartbeat stops the drive"
+    elif profile.monitoring == "heartbeat":
+        period_us, why = 0, "unused (communication_cycle_period): the heartbeat stops the drive"
+    produced_ms = _produced_ms(cycle, profile)
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", why),
         Setting(
@@ -370,20 +380,6 @@ def _reactions(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> 
     )
 
 
-def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
-    """Deceleration that stops a drive from top speed within a cycle, in the drive's unit."""
-    winch = rig.winches[drive]
-    ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
-    turns = ramp / winch.counts_per_turn
-    in_unit = {"counts/s^2": ramp, "rpm/s": 60.0 * turns, "rev/s^2": turns}
-    return in_unit[profile.acceleration_unit] / profile.acceleration_step
-
-
-def quick_stop_time(ramp: float, allowed: Range, cycle: float) -> float:
-    """Time of a quick stop from top speed, [s]: ``ramp`` would take a cycle, the drive may not."""
-    return cycle * max(1.0, ramp / max(1, allowed.high))
-
-
 def _options() -> tuple[Setting, ...]:
     return (
         Setting(
@@ -439,7 +435,8 @@ def _torque_limits(per_mille: int, profile: ProfileDocument) -> tuple[Setting, .
         return (standard,)
     rated = None if limit.rated is None else object_key(limit.rated)
     where, form = object_key(limit.object), "<H" if limit.bytes == 2 else "<I"
-    return standard, Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
+    setting = Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
+    return standard, setting.of_rated(limit.rated_value) if limit.rated_value else setting
 
 
 def _capped(index: int, name: str, value: float, why: str) -> Setting:

@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from drivers.cia402.state_machine import POWER_BITS, REMOTE
-from model.errors import BadInput
+from model.errors import BadInput, Refused
 from model.files.documents import load_yaml
 from model.files.drive_profile_file import (
     NEEDED,
@@ -209,18 +209,31 @@ def interpolation_time(
     )
 
 
+def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
+    """Deceleration that stops a drive from top speed within a cycle, in the drive's unit."""
+    winch = rig.winches[drive]
+    ramp = winch.max_speed / cycle * abs(winch.counts_per_metre)
+    turns = ramp / winch.counts_per_turn
+    in_unit = {"counts/s^2": ramp, "rpm/s": 60.0 * turns, "rev/s^2": turns}
+    return in_unit[profile.acceleration_unit] / profile.acceleration_step
+
+
+def quick_stop_time(ramp: float, allowed: Range, cycle: float) -> float:
+    """Time of a quick stop from top speed, [s]: ``ramp`` would take a cycle, the drive may not."""
+    return cycle * max(1.0, ramp / max(1, allowed.high))
+
+
 # What to do about an object that a drive does not have.
 
 SUPPORTED_MODES = 0x6502
 HOW_UNLISTED = "for a drive that has it unlisted, set csp_unlisted: true in its profile"
 HOW_WITHOUT_CSP = (
-    "use another drive if it has no cyclic synchronous position (CSP), as Technosoft iPOS and Pilz"
-    f" PRBT; {HOW_UNLISTED}"
+    f"use another drive if it has no cyclic synchronous position (CSP); {HOW_UNLISTED}"
 )
 
 _BESIDE = {
     "1006h:00": ", with monitoring: heartbeat",
-    "1016h:01": "; the SYNC time-out alone then stops the drive",
+    "1016h:01": ", with monitoring: sync; the SYNC time-out alone then stops the drive",
     "6072h:00": ", with torque_limit",
     "60C2h:01": ", where the drive needs no interpolation time",
     "60C2h:02": ", where the drive needs no interpolation time",
@@ -228,13 +241,16 @@ _BESIDE = {
 """Further entries of a profile in which an object is absent."""
 
 
-def how_without(profile: ProfileDocument, index: int, sub: int) -> str:
+def how_without(
+    profile: ProfileDocument, index: int, sub: int, read: Callable[[int, int, str], bytes | None]
+) -> str:
     """The next step for a required object that is missing.
 
     Args:
         profile: Of the drive.
         index: Of the object.
         sub: Of the object.
+        read: Reads an optional object of the drive by index, sub-index and name.
     """
     if index == SUPPORTED_MODES:
         return HOW_WITHOUT_CSP
@@ -242,10 +258,30 @@ def how_without(profile: ProfileDocument, index: int, sub: int) -> str:
     name = "1016h:01" if index == object_key("1016h:01")[0] else object_name(index, sub)
     if name not in OBJECTS or name in NEEDED:
         return _how_without_standard(profile, index, sub)
+    if _is_unmonitored(profile, name, read):
+        return "use another drive: nothing stops this one when the master is lost"
     own = f"list it as absent in your own drive profile{_BESIDE.get(name, '')}"
     names = [each for each in profile_names() if name in load_profile(each).absent]
     known = "".join(f"; for {load_profile(each).name} set drives.profile: {each}" for each in names)
     return own + known
+
+
+def _is_unmonitored(
+    profile: ProfileDocument, missing: str, read: Callable[[int, int, str], bytes | None]
+) -> bool:
+    """Whether a drive that lacks 1006h cannot use 1016h either, or the reverse."""
+    if missing == "1006h:00":
+        unusable, other = not profile.watches_heartbeats, "1016h:01"
+    elif missing == "1016h:01":
+        unusable, other = not profile.has(*object_key("1006h:00")), "1006h:00"
+    else:
+        return False
+    try:
+        return unusable or read(object_key(other)[0], 0, OBJECTS[other]) is None
+    except Refused as error:  # it may have the object
+        if "abort_code" not in error.values:
+            raise
+        return False
 
 
 def _how_without_standard(profile: ProfileDocument, index: int, sub: int) -> str:

@@ -53,6 +53,27 @@ NEEDED = (
 )
 """Without these no run is safe, whatever a profile states."""
 
+_RATED_SHARE = "6073h:00"
+"""Max current, in per mille of the rated current. Source: CiA 402-2."""
+
+_PROCESS_DATA = "rpdo and tpdo"
+_CYCLE = "bus.cycle_ms of the rig file"
+
+_DETERMINED_BY: Mapping[int, str] = {
+    0x1006: "monitoring and communication_cycle_period",
+    0x1016: "heartbeat_entries and heartbeat_loss",
+    0x1017: _CYCLE,
+    0x6040: _PROCESS_DATA,
+    0x6065: "motion.following_error_mm of the rig file",
+    0x6066: _CYCLE,
+    0x6072: "cables.max_tension_n of the rig file",
+    0x607A: _PROCESS_DATA,
+    0x607D: "workspace of the rig file",
+    0x6085: "acceleration_unit and acceleration_step",
+    0x60C2: _CYCLE,
+}
+"""Keys that determine the values of objects that the program writes; the others are constants."""
+
 STOP_CODES = (0x8130, 0x8250, 0x8611, 0x8612, 0x8700)
 """EMCY codes of drives that stop as they are set up: by 1016h, 1400h:05, 6065h, 607Dh, 1006h."""
 
@@ -122,13 +143,29 @@ class Expected(Document):
 class TorqueLimit(Document):
     """The object that limits torque where there is no 6072h; it holds a current."""
 
-    object: ObjectName = Field(description="the current limit")
+    object: ObjectName = Field(description="the current limit, proportional to the current")
     rated: ObjectName | None = Field(
         default=None,
-        description="the current at rated torque, in the same unit; left out, the limit is in per"
-        " mille of it, as 6073h",
+        description="the object with the current at rated torque, in the same unit; it and"
+        f" rated_value left out, which only {_RATED_SHARE} allows, the limit is in per mille of it",
+    )
+    rated_value: Annotated[float, Field(gt=0.0, le=1e9)] | None = Field(
+        default=None,
+        description="value of the limit at rated torque, where no object holds it",
     )
     bytes: Literal[2, 4] = Field(default=4, description="size of the current limit; 2 for 6073h")
+
+    @model_validator(mode="after")
+    def _has_unit(self) -> Self:
+        stated = [each for each in (self.rated, self.rated_value) if each is not None]
+        if len(stated) > 1:
+            raise ValueError("rated and rated_value exclude each other")
+        if not stated and self.object != _RATED_SHARE:
+            raise ValueError(
+                f"{self.object} needs rated or rated_value, the current at rated torque in its"
+                f" unit; only {_RATED_SHARE} is in per mille of it"
+            )
+        return self
 
 
 class ProfileDocument(Document):
@@ -160,6 +197,11 @@ class ProfileDocument(Document):
         default="sync",
         description="what stops a drive whose master is gone; heartbeat: it has no 1006h, does not"
         " detect missing SYNC by it, or removes torque without SYNC",
+    )
+    communication_cycle_period: Literal["cycle"] | None = Field(
+        default=None,
+        description="value of 1006h with monitoring heartbeat; cycle: the rig's cycle, to which the"
+        " drive synchronises; left out: 0",
     )
     sync_timeout_periods: Annotated[float, Field(ge=1.1, le=10.0)] = Field(
         default=3.0,
@@ -223,13 +265,18 @@ class ProfileDocument(Document):
 
     def rules(self) -> Sequence[Callable[[], list[Finding]]]:
         """Checks across keys."""
-        return (self._monitoring, self._torque, self._needed, self._warned)
+        return (self._monitoring, self._torque, self._needed, self._only_read, self._warned)
 
     def _monitoring(self) -> list[Finding]:
         if self.monitoring == "heartbeat" and self.heartbeat_loss == "fault":
             what = "drives that remove torque when the master is lost cannot be run safely"
             return [(("heartbeat_loss",), what)]
         by_heartbeat = self.monitoring == "heartbeat"
+        if {"1006h:00", "1016h:01"} <= {*self.absent}:
+            what = "a drive without 1006h:00 and 1016h:01 cannot be run: nothing stops it when the"
+            return [(("absent",), f"{what} master is lost")]
+        if "1006h:00" in self.absent and self.communication_cycle_period:
+            return [(("communication_cycle_period",), "needs 1006h:00, which is in absent")]
         if "1006h:00" in self.absent and not by_heartbeat:
             return [(("absent",), "monitoring must be heartbeat where 1006h:00 is absent")]
         if "1016h:01" in self.absent and by_heartbeat:
@@ -249,6 +296,37 @@ class ProfileDocument(Document):
             for index, name in enumerate(self.absent)
             if name in NEEDED
         ]
+
+    def _only_read(self) -> list[Finding]:
+        return [
+            (
+                ("expect", number, "object"),
+                f"this program writes {each.object} itself: use {keys} instead",
+            )
+            for number, each in enumerate(self.expect)
+            if (keys := self._keys_for(each.object))
+        ]
+
+    def _keys_for(self, name: str) -> str:
+        """The keys that control an object that is written; empty if it is not."""
+        index, sub = object_key(name)
+        if self.torque_limit is not None and name == self.torque_limit.object:
+            return f"torque_limit and {_DETERMINED_BY[0x6072]}"
+        if 0x1400 <= index < 0x1C00:
+            return _PROCESS_DATA if self._maps(index, sub) else ""
+        if index == 0x1016:
+            return _DETERMINED_BY[index] if sub else ""
+        if index in (0x6040, 0x607A) or name in OBJECTS:
+            return _DETERMINED_BY.get(index, "ranges" if name in NEEDED else "absent or ranges")
+        return ""
+
+    def _maps(self, index: int, sub: int) -> bool:
+        """Whether parameters of a PDO are written: of the used ones, and all identifiers."""
+        is_sent, is_mapping = bool(index & 0x800), bool(index & 0x200)
+        if index & 0x1FF != (self.tpdo if is_sent else self.rpdo) - 1:
+            return sub == 1 and not is_mapping
+        objects = 3 if is_sent else 2
+        return sub <= objects if is_mapping else sub in ((1, 2, 3) if is_sent else (1, 2, 5))
 
     def _warned(self) -> list[Finding]:
         return [

@@ -330,7 +330,8 @@ class SimulatedDrive(PowerStage):
         self._motion = motion_settings(self.objects, self._counts_per_turn, self._profile)
         get = self.objects.get
         self._heartbeat_period = get((0x1017, 0), 0) / 1000.0
-        self._sync_timeout = self.behaviour.sync_periods * get((0x1006, 0), 0) / 1e6
+        monitored = get((0x1006, 0), 0) if self._profile.monitoring == "sync" else 0
+        self._sync_timeout = self.behaviour.sync_periods * monitored / 1e6
         #: Of synchronous RPDOs after SYNC, [s]; 0: unlimited.
         self._sync_window = get((0x1007, 0), 0) / 1e6
         if not self._sync_timeout:

@@ -433,10 +433,11 @@ def motion_settings(
     home = get((0x607C, 0), 0)  # the drive subtracts it from its limits: CiA 402-2
     low, high = get((SOFTWARE_LIMITS, 1), -(2**31)), get((SOFTWARE_LIMITS, 2), 2**31 - 1)
     window = get((0x6065, 0), 0xFFFFFFFF)
-    limiting, rated = (0x6072, 0), 1000
+    limiting, rated = (0x6072, 0), 1000.0
     if (limit := profile.torque_limit) is not None:
-        limiting = object_key(limit.object)
-        rated = 1000 if limit.rated is None else get(object_key(limit.rated), 0)
+        limiting, rated = object_key(limit.object), limit.rated_value or 1000.0
+        if limit.rated is not None:
+            rated = get(object_key(limit.rated), 0)
     return MotionSettings(
         deceleration=max(1e-3, get((0x6085, 0), 1_000_000) * acceleration),
         max_torque=1000.0 * get(limiting, 2**32) / rated if rated else 0.0,

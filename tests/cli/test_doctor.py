@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 from importlib.metadata import packages_distributions
 from pathlib import Path
@@ -39,7 +40,10 @@ from executor.realtime import scheduling
 from executor.recording.summary import versions
 from model.errors import HardwareMissing
 from model.rig import load_rig, rig_from_document
+from simulation import factory
+from simulation.drives.behaviour import behaviour_named
 from simulation.drives.eds_file import profile_path, read_eds
+from simulation.factory import make_rehearsal
 from tests.cli.plans import RIG
 from tests.cli.program import call
 
@@ -434,6 +438,18 @@ def test_drives_of_another_make_are_reported_with_what_to_change(
     assert objects["3001h:02"]["found"] == [{"drives": list(range(1, 9)), "value": "absent"}]
     shown = call("doctor", with_profile(tmp_path, "epos4"), "--drives").out
     assert "…" not in shown, "the keys that the user types are not cut"
+
+
+@pytest.mark.parametrize("index", ["1006", "1016", "6065"])
+def test_drives_that_may_not_notice_a_lost_master_get_no_stopping_distance(
+    index: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The distance of the profile stood below a line that said what it relies on was absent."""
+    absent = behaviour_named([f"absent={index}"])
+    monkeypatch.setattr(factory, "make_rehearsal", partial(make_rehearsal, behaviour=absent))
+    answer = call("doctor", RIG, "--drives")
+    assert answer.code == 4
+    assert ("without the master" in answer.out) == (index == "6065")
 
 
 @pytest.mark.parametrize(

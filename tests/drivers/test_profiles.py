@@ -938,7 +938,19 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
         ('heartbeat_loss: fault\nmonitoring: heartbeat\nabsent: ["1006h:00"]', "remove torque"),
         ('absent: ["6072h:00"]', "torque_limit"),
         ('absent: ["6085h:00"]', "required for a safe run"),
-        ('absent: ["1006h:00", "1016h:01"]\nmonitoring: heartbeat', "needs 1016h:01"),
+        ('absent: ["1016h:01"]\nmonitoring: heartbeat', "needs 1016h:01"),
+        ('absent: ["1006h:00", "1016h:01"]', "nothing stops it when the master is lost"),
+        ("communication_cycle_period: 10000", "cycle"),
+        (
+            'communication_cycle_period: cycle\nmonitoring: heartbeat\nabsent: ["1006h:00"]',
+            "needs 1006h:00",
+        ),
+        ('torque_limit: {object: "207Fh:00", bytes: 2}', "207Fh:00 needs rated or rated_value"),
+        (
+            'torque_limit: {object: "6073h:00", rated: "6075h:00", rated_value: 819}',
+            "exclude each other",
+        ),
+        ('torque_limit: {object: "207Fh:00", rated_value: 0}', "rated_value"),
         ('warnings: ["31"]', "3180h"),
         ('warnings: ["3180h", "81xxh"]', "includes 8130h"),
         ('warnings: ["8612h"]', "includes 8612h"),
@@ -955,6 +967,84 @@ def test_a_wrong_profile_file_says_what_where_and_what_there_is(
     text = str(caught.value)
     assert message in text
     assert "lab.yaml:3" in text or ":3:" in text
+
+
+def expecting(tmp_path: Path, name: str, lines: str) -> str:
+    expected = f'expect: [{{object: "{name}", value: 1, name: x, why: y}}]'
+    return lab_profile(tmp_path, f"{lines}\n{expected}")
+
+
+MAKERS_LIMIT = 'absent: ["6072h:00"]\ntorque_limit: {object: "207Fh:00", rated_value: 819}'
+
+
+@pytest.mark.parametrize("lines", ["", "rpdo: 4\ntpdo: 3", MAKERS_LIMIT])
+def test_no_profile_expects_a_value_of_an_object_that_the_program_writes(
+    rig: Rig, tmp_path: Path, lines: str
+) -> None:
+    """The value was required before the set-up, and then overwritten."""
+    theirs = with_profile(rig, lab_profile(tmp_path, lines))
+    settings = (*settings_for(theirs, 0, WinchMap(theirs)), *heartbeat_consumers(theirs, 0, 2))
+    written = {(setting.index, setting.sub) for setting in settings}
+    written |= {(index, 1) for index in UNUSED_PDOS}
+    written |= {(job.index, job.sub) for job in monitoring_off(2)} - {(0x1400, 5)}
+    written |= {(0x6040, 0), (0x607A, 0)}
+    for index, sub in sorted(written):
+        name = f"{index:04X}h:{sub:02X}"
+        with pytest.raises(InvalidFile, match=f"this program writes {name} itself"):
+            load_profile(expecting(tmp_path, name, lines))
+
+
+@pytest.mark.parametrize(
+    ("name", "keys"),
+    [
+        ("1006h:00", "monitoring and communication_cycle_period"),
+        ("1016h:02", "heartbeat_entries and heartbeat_loss"),
+        ("1A00h:02", "rpdo and tpdo"),
+        ("6085h:00", "acceleration_unit and acceleration_step"),
+        ("6007h:00", "ranges"),
+        ("1007h:00", "absent or ranges"),
+        ("207Fh:00", "torque_limit and cables.max_tension_n of the rig file"),
+    ],
+)
+def test_the_refusal_of_an_expected_object_names_the_keys_that_control_it(
+    tmp_path: Path, name: str, keys: str
+) -> None:
+    with pytest.raises(InvalidFile) as caught:
+        load_profile(expecting(tmp_path, name, MAKERS_LIMIT))
+    assert f"this program writes {name} itself: use {keys} instead\n" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["60A8h:00", "607Eh:00", "1016h:00", "1401h:02", "1601h:01", "1800h:05", "1A00h:04"]
+)
+def test_a_profile_expects_values_of_objects_that_are_only_read(tmp_path: Path, name: str) -> None:
+    (expected,) = load_profile(expecting(tmp_path, name, "")).expect
+    assert expected.object == name
+
+
+@pytest.mark.parametrize("monitoring", ["sync", "heartbeat"])
+def test_a_drive_that_synchronises_by_1006h_keeps_the_cycle_there(
+    rig: Rig, tmp_path: Path, monitoring: str
+) -> None:
+    """0 ends the synchronisation to SYNC in some makes; the heartbeat stops the drive all the same.
+
+    Sources: Infranor XtraPulsGEM and CD1-k manuals, object 1006h; Bonfiglioli CM-CAN, page 57.
+    """
+    lines = f"monitoring: {monitoring}\ncommunication_cycle_period: cycle"
+    theirs, bus = with_profile(rig, lab_profile(tmp_path, lines)), eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x1006, 0] = 10_000
+    (row,) = (row for row in examined(theirs, bus).rows if row.object.startswith("1006h"))
+    assert (row.verdict, row.needed) == ("ok", "10000, written at configuration")
+    set_up(theirs, bus)
+    assert {drive.values[0x1006, 0] for drive in bus.drives.values()} == {10_000}
+    written = [d.data[4:] for d in downloads(bus) if d.data[1:4] == b"\x06\x10\0"]
+    assert {int.from_bytes(data, "little") for data in written} == {10_000}
+    lost = lost_master(theirs)
+    by_heartbeat = ("heartbeat", pytest.approx(0.1))
+    assert (lost.noticed_by, lost.notice) == (
+        by_heartbeat if monitoring == "heartbeat" else ("SYNC", pytest.approx(0.03))
+    )
 
 
 def test_a_profile_of_the_lab_is_used(tmp_path: Path, rig: Rig) -> None:
@@ -1095,6 +1185,64 @@ def test_doctor_names_what_a_profile_of_ones_own_says(rig: Rig) -> None:
     assert change["1006h:00"].startswith("list it as absent in your own drive profile, with")
     assert "monitoring: heartbeat" in change["1006h:00"]
     assert "no profile" in change["6007h:00"]
+
+
+UNMONITORED = "use another drive: nothing stops this one when the master is lost"
+
+
+@pytest.mark.parametrize(
+    ("lines", "absent"),
+    [
+        ("", ["1006h:00", "1016h:00"]),
+        ("monitoring: heartbeat", ["1006h:00", "1016h:00"]),
+        ('absent: ["1006h:00"]\nmonitoring: heartbeat', ["1016h:00"]),
+        ('absent: ["1016h:01"]', ["1006h:00"]),
+        ("heartbeat_loss: fault", ["1006h:00"]),
+    ],
+)
+def test_doctor_sees_that_nothing_would_stop_a_drive_without_its_master(
+    rig: Rig, tmp_path: Path, lines: str, absent: list[str]
+) -> None:
+    """Each line named the other object as the solution; both absent were refused."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.aborts |= dict.fromkeys([(0x1006, 0), (0x1016, 0), (0x1016, 1)], 0x06020000)
+    rows = examined(with_profile(rig, lab_profile(tmp_path, lines)), bus).rows
+    wrong = {row.object[:8]: row.change for row in rows if row.verdict == "wrong"}
+    assert wrong == dict.fromkeys(absent, UNMONITORED)
+
+
+@pytest.mark.parametrize(
+    ("missing", "step"),
+    [
+        (0x1006, "list it as absent in your own drive profile, with monitoring: heartbeat"),
+        (0x1016, "list it as absent in your own drive profile, with monitoring: sync"),
+    ],
+    ids=["1006h", "1016h"],
+)
+@pytest.mark.parametrize("other", [None, 0x08000022], ids=["present", "not now"])
+def test_doctor_names_the_other_object_that_stops_a_drive(
+    rig: Rig, missing: int, step: str, other: int | None
+) -> None:
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.aborts[missing, 0] = 0x06020000
+        if other is not None:
+            drive.aborts[0x1006 if missing == 0x1016 else 0x1016, 0] = other
+    change = {row.object[:8]: row.change for row in examined(rig, bus).rows}
+    assert change[f"{missing:04X}h:00"].startswith(step)
+
+
+def test_the_texts_on_supported_modes_name_no_make(rig: Rig) -> None:
+    """Technosoft iPOS has CSP since 2017: manual P091.063.iPOS.STO.UM.0117, section 10."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x6502, 0] = 0x65
+    (row,) = (row for row in examined(rig, bus).rows if row.object.startswith("6502h"))
+    for text in (row.meaning, row.change):
+        assert "Technosoft" not in text
+        assert "Pilz" not in text
+        assert "csp_unlisted: true" in text
 
 
 def test_doctor_names_the_keys_for_process_data_that_cannot_be_mapped(rig: Rig) -> None:
@@ -1303,6 +1451,21 @@ def test_a_current_limit_of_16_bits_is_set(rig: Rig, tmp_path: Path, keys: str, 
     theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
     with_max_current(bus)
     assert examined(theirs, bus).good
+    set_up(theirs, bus)
+    assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
+
+
+@pytest.mark.parametrize(("rated", "limit"), [("819", 983), ("0.5", 1), ("54000", 64800)])
+def test_a_current_limit_in_a_unit_that_no_object_states_is_set(
+    rig: Rig, tmp_path: Path, rated: str, limit: int
+) -> None:
+    """Per mille were written to it unnoticed, as of the drive's peak current of 40 A."""
+    line = f"torque_limit: {{object: '6073h:00', bytes: 2, rated_value: {rated}}}"
+    theirs = with_profile(rig, lab_profile(tmp_path, f'{line}\nabsent: ["6072h:00"]'))
+    bus = eight_of("cia402")
+    with_max_current(bus)
+    (row,) = (row for row in examined(theirs, bus).rows if row.object.startswith("6073h"))
+    assert row.needed == f"{limit}, written at configuration"
     set_up(theirs, bus)
     assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.can_bus import BusSettings, open_bus
+from drivers.cia402.profile import load_profile
 from drivers.cia402.state_machine import DriveState
 from model.errors import BadInput
 from model.rig import Rig
@@ -199,6 +200,22 @@ def test_without_1006h_sync_is_not_watched() -> None:
     line.enable()
     line.drive.advance(1.0)
     assert line.drive.state is DriveState.OPERATION_ENABLED
+
+
+@pytest.mark.parametrize(
+    ("monitoring", "state"),
+    [("sync", DriveState.QUICK_STOP_ACTIVE), ("heartbeat", DriveState.OPERATION_ENABLED)],
+)
+def test_a_make_that_does_not_detect_missing_sync_keeps_1006h_without_a_reaction(
+    monitoring: str, state: DriveState
+) -> None:
+    """Drives that synchronise to SYNC by 1006h; the heartbeat alone stops them."""
+    profile = load_profile("cia402").model_copy(update={"monitoring": monitoring})
+    line = ready(profile=profile)
+    line.enable()
+    line.drive.advance(1.0)
+    assert line.read(0x1006, 0) == 10_000
+    assert line.drive.state is state
 
 
 def test_a_wider_range_than_that_of_the_eds_file_accepts_no_more() -> None:

@@ -6,6 +6,8 @@ import struct
 
 import pytest
 
+from drivers.cia402.profile import load_profile
+from model.files.drive_profile_file import TorqueLimit
 from tests.simulation.drive_line import (
     CYCLE,
     DISABLED,
@@ -17,6 +19,7 @@ from tests.simulation.drive_line import (
     SPEED,
     STOPPED,
     Line,
+    ready,
 )
 
 
@@ -202,6 +205,18 @@ def test_at_the_torque_limit_the_motor_does_not_wind_in_further(line: Line) -> N
     line.sync(0x0F, 1050)
     line.sync(0x0F)
     assert line.drive.motor.position == 1050  # paying out is not
+
+
+def test_a_torque_limit_is_in_the_unit_of_its_profile() -> None:
+    limit = TorqueLimit(object="6072h:00", bytes=2, rated_value=819.0)
+    profile = load_profile("cia402").model_copy(update={"torque_limit": limit})
+    line = ready(profile=profile)
+    line.write(0x6072, 0, "<H", 983)  # 1200 per mille
+    line.enable()
+    for torque, shown in ((-1199.0, 0x1000), (-1201.0, 0x1800)):
+        line.drive.torque = torque
+        line.sync(0x0F)
+        assert line.word & 0x1800 == shown
 
 
 def test_above_the_torque_limit_the_load_turns_the_motor_back(line: Line) -> None:
