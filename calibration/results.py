@@ -32,8 +32,8 @@ from model.files.rig_file import RigDocument
 from model.pages.page import html_table
 
 USE = (
-    "use it: pass the result's file with --calibration, or write a new rig file with"
-    " `cdpr calibrate apply`"
+    "use it: pass the result's file with --calibration, in Python rig.with_calibration(), or write"
+    " a new rig file with `cdpr calibrate apply`"
 )
 """Next step for a result that is good enough."""
 

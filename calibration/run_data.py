@@ -46,7 +46,7 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
         raise BadInput(
             f"camera {camera!r} took no images in this run",
             where=str(folder),
-            next_step=f"name one of its cameras with --camera: {', '.join(names)}",
+            next_step=f"name one of its cameras with `camera=`: {', '.join(names)}",
         )
     samples = alone[camera] if alone else run.poses()
     times, known = cycles.time, cycles.has_encoder_pose
@@ -100,14 +100,14 @@ def require_reflector_used(measured: RigMeasurements, reflector: Array) -> None:
     used = measured.has_position & measured.reflectors.any(axis=1)
     if not used.any():
         raise BadInput(
-            "--reflector-mm is for positions in CSV files; none are used",
+            "`reflector=` is for positions in CSV files; none are used",
             where="reflector",
             next_step="leave it out, or pass a CSV file with x_mm, y_mm, z_mm",
         )
     rotated = measured.has_rotation[used]
     if rotated.any() and not rotated.all():
         raise BadInput(
-            "--reflector-mm is for one tracker, but only some of the CSV files have rotations",
+            "`reflector=` is for one tracker, but only some of the CSV files have rotations",
             where="reflector",
             why="poses with and without rotations may be those of different points",
             next_step="write all positions for the platform's origin and leave it out, or pass"

@@ -1,7 +1,7 @@
 """Plan, prove, run and measure paths of cable-driven parallel robots.
 
 Functions as the verbs of the command line, with the same defaults; lengths in metres, forces in
-newtons, angles in radians. Every name is loaded at first use.
+newtons, angles in radians. Every name is loaded at first use; `__version__` is that of the package.
 """
 
 from __future__ import annotations
@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from planner.planning import plan_from_waypoints
     from tracking.tracker import Tracker
 
+    __version__: str
+
 __all__ = [
     "BadInput",
     "CdprError",
@@ -93,7 +95,7 @@ __all__ = [
 ]
 
 if not TYPE_CHECKING:
-    __getattr__, __dir__ = lazy_names(
+    _load, __dir__ = lazy_names(
         __name__,
         {
             "calibration.geometry.pose_selection": "measurement_poses",
@@ -118,3 +120,12 @@ if not TYPE_CHECKING:
             "tracking.tracker": "Tracker",
         },
     )
+
+    def __getattr__(name: str) -> object:
+        """A public name or the version, loaded when first used."""
+        if name != "__version__":
+            return _load(name)
+        # Takes longer to import than all else here.
+        from importlib.metadata import version
+
+        return version("cdpr")

@@ -23,7 +23,9 @@ from planner.settings import whole_number
 def open_camera(
     rig: Rig, source: str | int | Path, camera: str | None = None
 ) -> ImageFolder | VideoFile | LiveCamera:
-    """The images of one of the rig's cameras, as an iterable; a live one is a context manager.
+    """The images of one of the rig's cameras, as an iterable and context manager.
+
+    The end of the ``with`` block, which only a live camera needs, releases the camera.
 
     Args:
         rig: The robot with its cameras.
@@ -46,7 +48,7 @@ def open_camera(
 
 def track(
     rig: Rig,
-    source: str | int | Path | Mapping[str, str | int],
+    source: str | int | Path | Mapping[str, str | int | Path],
     *,
     camera: str | None = None,
     scene: Scene | None = None,

@@ -22,14 +22,16 @@ def main(
     camera = rig.camera()  # the first of the rig file, or rig.camera("front")
     tracker = cdpr.Tracker(rig, camera)
 
-    for frame in cdpr.open_camera(rig, source, camera.name):
-        found = tracker.observe(frame.image, frame.time)
-        if isinstance(found, NoPose):
-            print(f"{frame.name}: {found.reason}")
-            continue
-        x, y, z = found.pose.position * 1000
-        sigma = found.position_deviation.max() * 1000
-        print(f"{frame.name}: {x:8.2f} {y:8.2f} {z:8.2f} mm, 1 sigma {sigma:.2f} mm, {found.tags}")
+    with cdpr.open_camera(rig, source, camera.name) as images:
+        for frame in images:
+            found = tracker.observe(frame.image, frame.time)
+            if isinstance(found, NoPose):
+                print(f"{frame.name}: {found.reason}")
+                continue
+            x, y, z = found.pose.position * 1000
+            sigma = found.position_deviation.max() * 1000
+            where = f"{x:8.2f} {y:8.2f} {z:8.2f} mm"
+            print(f"{frame.name}: {where}, 1 sigma {sigma:.2f} mm, {found.tags}")
 
 
 if __name__ == "__main__":

@@ -237,7 +237,8 @@ def rig_cameras(rig: Rig, sources: Sequence[str]) -> list[MachineCheck]:
     devices = ", ".join(str(path) for path in sorted(Path("/dev").glob("video*"))) or "none"
     checks = []
     for camera in rig.cameras:
-        text = f"not tested (--camera {camera.name}=INDEX tests it); devices here: {devices}"
+        text = f"not tested (--camera {camera.name}=INDEX tests it, in Python"
+        text += f" camera='{camera.name}=INDEX'); devices here: {devices}"
         text += _unstated_gamma(rig, camera)
         checks.append(MachineCheck(f"camera {camera.name}", True, text))
     return checks

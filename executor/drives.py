@@ -443,6 +443,7 @@ def current_pose(rig: Rig, counts: Array, load: Load) -> Pose:
         where="drive positions",
         why="the homing reference is lost, a cable slipped, the rig file is wrong, or homing left"
         " tensions far from the planned ones",
-        next_step="home the drives at a known pose, with a pretension (`--tension-n`) near the"
-        f" planned {tensions.min():.0f} to {tensions.max():.0f} N; nothing was moved",
+        next_step="home the drives at a known pose, with a pretension (--tension-n, in Python"
+        f" tension=) near the planned {tensions.min():.0f} to {tensions.max():.0f} N; nothing was"
+        " moved",
     )

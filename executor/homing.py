@@ -14,7 +14,12 @@ import numpy as np
 
 from executor.cameras.client import static_pose
 from executor.cameras.open import measure_at_rest
-from executor.cameras.sources import choose_one_camera, require_synthetic_images
+from executor.cameras.sources import (
+    OneCamera,
+    choose_one_camera,
+    require_synthetic_images,
+    source_texts,
+)
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
 from executor.control.winch_loop import MakeLaw
 from executor.control.winch_motion import WinchResult
@@ -34,7 +39,6 @@ from model.errors import (
     real_number,
     require_functions,
     require_types,
-    sequence_of,
     truth_value,
 )
 from model.kinematics import cable_lengths
@@ -93,7 +97,7 @@ def home(
     *,
     at_home: bool = False,
     pose: Pose | None = None,
-    camera: str | int | Sequence[str | int] | None = None,
+    camera: OneCamera | Sequence[OneCamera] | None = None,
     tension: float | None = None,
     limit: float | None = None,
     reach: float = REACH,
@@ -116,7 +120,8 @@ def home(
         rig: The robot and its bus.
         at_home: A jig holds the platform at the rig's home pose.
         pose: A jig holds the platform at this pose, ``world_from_platform``.
-        camera: The platform hangs free and this camera measures it: a source or ``NAME=SOURCE``.
+        camera: The platform hangs free and this camera measures it: index, device file or address,
+            ``NAME=SOURCE`` of one of several, or ``synthetic`` with simulated drives.
         tension: Pretension, [N]; None for the tensions planned at a stated pose, at most 80 % of
             the limit, or with a camera for twice the rig's smallest tension.
         limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
@@ -145,9 +150,7 @@ def home(
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     in_process = is_simulated(rig)
     require_drives(rig, realtime)
-    if isinstance(camera, str | int | np.integer):
-        camera = [str(camera)]
-    sources = [str(source) for source in sequence_of("camera", () if camera is None else camera)]
+    sources = [] if camera is None else source_texts("camera", camera)
     require_one_pose(at_home, pose, sources)
     reach, speed = real_number("reach", reach, "m"), real_number("speed", speed, "m/s")
     pictures = whole_number("pictures", pictures, least=FEWEST_IMAGES, most=MOST_IMAGES)

@@ -51,6 +51,7 @@ _ROUNDED = 1.0 + 1e-12
 """Tolerance for the rounding of a length converted from mm to m and back."""
 #: Largest and default speed of a jog, [m/s].
 FASTEST, SPEED = 0.020, 0.005
+_PLAN_FROM_HERE = "plan a path from here: `cdpr plan --start-mm`, in Python cdpr.plan(start=)"
 
 
 def jog(
@@ -180,7 +181,7 @@ def plan_straight_move(
             f" {document.quality.length_mm:.1f} mm",
             where="cdpr jog",
             why="cables or platform would be too close to an obstacle on the straight path",
-            next_step="jog in another direction, or plan a path with `cdpr plan --start-mm`",
+            next_step=f"jog in another direction, or {_PLAN_FROM_HERE}",
         )
     return document
 
@@ -219,7 +220,7 @@ def _require_jog(length_mm: float, turn_deg: float) -> None:
             f" {MOST_DEG:g}°",
             where="cdpr jog",
             why="longer motions need a plan that avoids obstacles",
-            next_step="jog a shorter distance, or plan a path from here: `cdpr plan --start-mm`",
+            next_step=f"jog a shorter distance, or {_PLAN_FROM_HERE}",
         )
 
 

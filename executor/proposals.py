@@ -132,7 +132,7 @@ def _describe_clearance_stop(
 ) -> str:
     """Threshold of the clearance stop, or why it is off."""
     if not clearance_stop:
-        return "off (--no-clearance-stop)"
+        return "off (--no-clearance-stop, in Python clearance_stop=False)"
     if not cameras:
         return "off (no camera)"
     if not scene.obstacles:

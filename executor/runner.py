@@ -62,10 +62,7 @@ from tracking.clearance import require_stated_errors
 
 __all__ = ["RunOptions", "RunResult", "run", "run_prepared"]
 
-_PASS_THE_RIG = "; then plan again, or pass --rig FILE, in Python `rig=`: a plan contains its rig"
-
-#: Rate of progress reports without a camera, [Hz].
-PROGRESS_RATE = 10.0
+_PASS_THE_RIG = "; then plan again, or pass `rig=`: a plan contains its rig"
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -106,7 +103,9 @@ def run(
         plan: The plan.
         rig: The robot, and the bus of its drives.
         folder: Run folder to create; None for a dated one in ``runs``.
-        cameras: Cameras that measure the platform.
+        cameras: Those that measure the platform: a source (index, device file or address), several
+            by name as ``{"front": 0}`` or ``["front=0"]``, ``"synthetic"``, or ``[]`` for none;
+            None for all of the rig file, synthetic on ``virtual``, an error on a bus.
         realtime: False for simulated time, as fast as possible.
         start: Pose of the simulated platform, ``world_from_platform``; None for the plan's start.
         clearance_stop: Stop along the path when the cameras measure too small a clearance.
@@ -305,8 +304,7 @@ def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _Mo
     prepared, options, on_event = job.prepared, job.options, job.options.on_event
     listener, fast = moved.listener, not options.realtime
     rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
-    rate = asked_rate(job.cameras) if job.cameras else PROGRESS_RATE
-    every = cycles_per_image(rate, cycle)
+    every = cycles_per_image(asked_rate(job.cameras), cycle)
     status = RunStatus(prepared, job.folder.path, board, simulated_time=fast)
     opening = partial(open_cameras, prepared, job.cameras, job.folder.path, board)
     with ExitStack() as stack:

@@ -248,7 +248,7 @@ def corrected(
             raise BadInput(
                 f"two results of kind {result.kind} for {result.name!r}:"
                 f" {seen[what]} and {result.date}",
-                where="--calibration",
+                where="--calibration, in Python rig.with_calibration()",
                 next_step="pass only the current one",
             )
         seen[what] = result.date

@@ -216,7 +216,7 @@ def require_same_rig(plan: Plan, rig: Rig, plan_path: Path | str) -> None:
         where=str(plan_path),
         why=f"these parts of the rig file differ: {', '.join(differing)}",
         next_step="plan again for this rig with `cdpr plan`; or, if the plan was made with"
-        " --calibration, pass the same --calibration here",
+        " --calibration, pass the same --calibration here, in Python rig.with_calibration()",
     )
 
 

@@ -264,7 +264,8 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
             f"at the {name} {near.first} is {gap} mm from {near.second},"
             f" less than the required {least} mm"
         )
-    given = "" if key == "self_mm" else ", or --clearance-mm of `cdpr plan` and `cdpr jog`,"
+    given = ", or --clearance-mm of `cdpr plan` and `cdpr jog`, in Python clearance=,"
+    given = "" if key == "self_mm" else given
     why = f"the scene's clearance.{key}{given} plus 0.05 mm that the planner keeps in reserve"
     next_step = f"move the {name} or the obstacle, or reduce the clearance"
     values: dict[str, float | str] = {
@@ -330,7 +331,7 @@ def _require_holdable(rig: Rig, scene: Scene, name: str, pose: Pose, *, turns: b
     has, needs, _ = distinct_figures((margin, reserve, 0.0), 2)
     larger = f"move the {name} to a larger margin (`cdpr workspace` maps it), {remedy(*binding)}"
     if turns and margin >= margin_reserve(rig, scene.load, turns=False):
-        larger += ", or plan without rotation (no `--free-rotation`)"
+        larger += ", or plan without `free_rotation=True`"
     if 0.0 <= margin < inertial_wrench(rig, scene.load, turns=turns):
         raise BadInput(
             f"at the {name} the cables can hold the platform, but not accelerate it by its motion"

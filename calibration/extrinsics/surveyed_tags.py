@@ -111,7 +111,7 @@ def require_frame_tags(rig: Rig) -> None:
             "the rig has no frame tags to locate the camera",
             where=f"rig {rig.name}",
             next_step="survey tags on the frame and add them to the rig file under tags: frame, or"
-            " pass --poses to use the rig's own motion",
+            " pass `poses=` to use the rig's own motion",
         )
 
 

@@ -331,7 +331,7 @@ def fit_rig(
             "there is nothing to calibrate",
             where="calibrate rig",
             why="every group of parameters is taken as known",
-            next_step="leave out --known for one of them",
+            next_step="leave out --known for one of them, in Python add it to deviations=",
         )
     fit, observability = identified(parameters, measured, length_deviation)
     agreeing = without_outliers(measured, fit, FEWEST_SAMPLES)
@@ -399,7 +399,7 @@ def _require_sensors(rig: Rig, measured: RigMeasurements, deviations: Mapping[st
             "the IMU's mounting cannot be found: no data have its columns",
             where="calibrate rig",
             next_step="add the columns accel_x_m_s2, accel_y_m_s2, accel_z_m_s2, or leave out"
-            " --imu-mounting-deg",
+            " --imu-mounting-deg, in Python imu_mounting in deviations=",
         )
     upwards = measured.first_rotations(rig)[:, 2]
     apart = np.arccos(np.clip(np.sum(upwards * measured.verticals, axis=1), -1.0, 1.0))

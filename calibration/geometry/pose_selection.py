@@ -82,8 +82,8 @@ def choose_poses(
         raise NoSolution(
             f"only {len(found)} of {2 * requirements.candidates} tried poses are feasible and free",
             where=f"rig {rig.name}, scene {scene.name}",
-            next_step="use fewer poses, less --reserve-n, less clearance in the scene, or more"
-            " --candidates",
+            next_step="use fewer poses, a smaller `reserve=`, less clearance in the scene, or more"
+            " `candidates=`",
         )
     rows = _rows(rig, scene.load, found, requirements, parameters)
     best = _d_optimal(rows, requirements.count)

@@ -183,7 +183,8 @@ _INSET = 0.15
 """The workspace is assessed at its centre and this share inside its corners."""
 _COMMON = (
     "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
-    " --pose-mm and --pose-deg: all measured poses share it, so more of them do not help"
+    " --pose-mm and --pose-deg, in Python pose_deviations=: all measured poses share it, so more of"
+    " them do not help"
 )
 """Next step where errors common to all measured poses are the larger part."""
 
@@ -276,7 +277,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
                 _COMMON
                 if rotated_common**2 > 0.5 * rotated**2
                 else f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
-                " (`cdpr calibrate poses` plans it), or pass --tilt-deg 0 if it never rotates",
+                " (`cdpr calibrate poses` plans it); if it never rotates, pass --tilt-deg 0, in"
+                " Python tilt=0",
             )
         )
     error = max(missed, level, rotated)
@@ -334,7 +336,8 @@ def _stiffness_issues(result: RigCalibration) -> list[Issue]:
             f"the data give a cable stiffness of {compliance}, the rig file"
             f" {result.rig.cable_stiffness.mean():.6g} N",
             "check cables: stiffness_n of the rig file, and the measured tensions;"
-            " if it is truly that far off, pass a larger --stiffness-percent",
+            " if it is truly that far off, pass a larger --stiffness-percent, in Python"
+            " stiffness in deviations=",
         )
     ]
 
@@ -348,7 +351,8 @@ def _difference_issues(result: RigCalibration) -> list[Issue]:
             f"the cables differ: the data give stiffnesses of {differences}; the result has"
             f" {result.geometry.stiffness.mean():.4g} N for all",
             "check for a cable that is worn, loose on its drum or of another kind, and check its"
-            " measured tensions; if they truly differ, pass --stiffness-per-cable",
+            " measured tensions; if they truly differ, pass --stiffness-per-cable, in Python"
+            " cable_stiffness in deviations=",
         )
     ]
 
@@ -364,7 +368,8 @@ def _tension_issues(result: RigCalibration) -> list[Issue]:
     return [
         Issue(
             f"tensions were not measured at {missing} poses, which makes cable lengths"
-            f" uncertain by {stretch * 1e3:.2g} mm; --length-mm is {usual * 1e3:.2g}",
+            f" uncertain by {stretch * 1e3:.2g} mm; from the encoders alone it is"
+            f" {usual * 1e3:.2g} mm",
             "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
         )
     ]
@@ -382,7 +387,8 @@ def _sensor_issues(result: RigCalibration) -> list[Issue]:
         Issue(
             f"residuals of {names} are up to {times[bad].max():.2g} times their stated deviation",
             "check feed_directions in the rig file and the axes of the IMU (--imu-mounting-deg"
-            " finds its mounting), or pass a larger --swivel-deg or --imu-deg",
+            " finds its mounting), or pass a larger --swivel-deg or --imu-deg; in Python"
+            " imu_mounting in deviations=, swivel_deviation= and imu_deviation=",
         )
     ]
 
@@ -393,13 +399,10 @@ def _pose_issues(result: RigCalibration) -> list[Issue]:
         Issue(
             f"the measured {what} scatter {times:.3g} times as much as stated",
             "check the camera's lens, the layout of the tags and the stated errors of the poses, or"
-            f" pass a larger {option}",
+            f" pass a larger --pose-{unit}, in Python pose_deviations=",
         )
-        for what, times, option in zip(
-            ("positions", "rotations"),
-            result.pose_scales,
-            ("--pose-mm", "--pose-deg"),
-            strict=True,
+        for what, times, unit in zip(
+            ("positions", "rotations"), result.pose_scales, ("mm", "deg"), strict=True
         )
         if times > SCATTERED
     ]

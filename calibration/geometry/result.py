@@ -283,7 +283,8 @@ def require_same_nominal(rig: Rig, others: Sequence[tuple[str, Rig]]) -> Rig:
                 where=name,
                 why="it is from another rig, the rig file was changed since, or it was run with a"
                 " calibration of the rig",
-                next_step="pass the rig file that it was run with, without --calibration",
+                next_step="pass the rig file that it was run with, without --calibration, in Python"
+                " without rig.with_calibration()",
             )
         homes = [[w.home_counts for w in r.winches] for r in (other, others[0][1])]
         if homes[0] != homes[1]:

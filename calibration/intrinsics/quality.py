@@ -133,7 +133,8 @@ def judge_camera(
             what = (
                 f"points are seen within {error / scale:.2g} px; {GOOD_PIXELS:.0f} px is required"
             )
-            issues.append(Issue(what, f"{_more(result)}, or pass --distance-m"))
+            step = f"{_more(result)}, or pass --distance-m, in Python distance="
+            issues.append(Issue(what, step))
     verdict = CalibrationVerdict.of(error, wanted, where, issues)
     nearest, farthest = min(away), max(away)
     return CameraQuality(
@@ -142,7 +143,7 @@ def judge_camera(
 
 
 def _unreached(result: CameraCalibration) -> BadInput:
-    other = "" if result.lens.name == "five" else ", or fit fewer coefficients with --lens five"
+    other = "" if result.lens.name == "five" else ", or fit fewer coefficients with `lens='five'`"
     return BadInput(
         f"the fitted lens ({result.lens.name}) has no ray through a part of the image",
         why="the corners do not determine it there, as with the board always in the middle",
@@ -301,13 +302,13 @@ def _size_issues(result: CameraCalibration) -> list[Issue]:
         case TagGrid() as grid:
             gap, share = _gap_of(result, grid)
             if share > _EXPLAINED:
-                options = "--tag-mm or --gap-mm"
+                options = "--tag-mm or --gap-mm, in Python tag= or gap="
                 what = f"gaps of {gap * 1e3:.3g} mm between tags of {grid.tag * 1e3:g} mm"
                 what += f", not {grid.gap * 1e3:g} mm"
         case Charuco() as board:
             side = float(np.median([seen.marker for seen in result.views.values()]))
             if abs(side / board.marker - 1.0) > _OTHER_MARKER:
-                options = "--square-mm or --marker-mm"
+                options = "--square-mm or --marker-mm, in Python square= or marker="
                 what = f"markers of about {side * 1e3:.2g} mm in squares of {board.square * 1e3:g}"
                 what += f" mm, not {board.marker * 1e3:g} mm"
     step = f"measure the print, and correct {options}"
@@ -349,7 +350,8 @@ def _lens_issues(result: CameraCalibration, radial: float) -> list[Issue]:
         " errors depend on the distance from the image centre"
     )
     others = [name for name in LENSES if name != result.lens.name]
-    return [Issue(what, f"try another model: --lens {', '.join(others[:-1])} or {others[-1]}")]
+    step = f"try another model: --lens {', '.join(others[:-1])} or {others[-1]}, in Python lens="
+    return [Issue(what, step)]
 
 
 def _more(result: CameraCalibration) -> str:

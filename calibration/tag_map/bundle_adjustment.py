@@ -244,7 +244,7 @@ def require_tags(rig: Rig, fixed: int | None) -> None:
     if fixed is not None and fixed not in numbers:
         raise BadInput(
             f"no tag {fixed} on the platform",
-            where="--fixed-tag",
+            where="`fixed_tag=`",
             why=known,
             next_step="name one of them",
         )

@@ -338,12 +338,12 @@ class Charuco:
         exchanged = replace(self, columns=self.rows, rows=self.columns)
         for other in (exchanged, replace(exchanged, legacy=not self.legacy)):
             if self.columns != self.rows and other.find(image) is not None:
-                legacy = " --legacy" if other.legacy else ""
-                return f"{other}: try --columns {other.columns} --rows {other.rows}{legacy}"
+                legacy = " `legacy=True`" if other.legacy else ""
+                return f"{other}: try `columns={other.columns}` `rows={other.rows}`{legacy}"
         if replace(self, legacy=not self.legacy).find(image) is not None:
-            use = "without --legacy" if self.legacy else "with --legacy"
+            use = "without" if self.legacy else "with"
             drawn = "4.6 and later draw" if self.legacy else "before 4.6 drew"
-            return f"the board as versions of OpenCV {drawn} it: try {use}"
+            return f"the board as versions of OpenCV {drawn} it: try {use} `legacy=True`"
         family = self.dictionary if self.dictionary in FAMILIES else FAMILIES[-1]
         tags = diagnose_tags(image, family, [])
         fours = TagDetector("4X4_1000").detect(image)

@@ -395,11 +395,11 @@ class TagGrid:
         """The tags in another order or grid, else tags that the image shows."""
         other = next(order for order in ORDERS if order != self.order)
         if replace(self, order=other).find(image) is not None:
-            return f"these tags {ORDERS[other]}: try --order {other}"
+            return f"these tags {ORDERS[other]}: try `order={other!r}`"
         if (grid := self._as_seen(image)) is not None and grid.find(image) is not None:
             names = ("columns", "rows", "first", "order")
-            options = {name: getattr(grid, name) for name in names}
-            wrong = [f"--{n} {value}" for n, value in options.items() if getattr(self, n) != value]
+            right = {name: getattr(grid, name) for name in names}
+            wrong = [f"`{n}={value!r}`" for n, value in right.items() if getattr(self, n) != value]
             return f"tags that fit {grid}: try {' '.join(wrong)}"
         return diagnose_tags(image, self.family, [])
 

@@ -22,6 +22,7 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperCommand, TyperGroup
 
+import cdpr
 from cdpr.cli.arguments import as_command, flag
 from model.errors import (
     BadInput,
@@ -212,10 +213,7 @@ EPILOG = (
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        # Takes longer to import than all else here, and only this option needs it.
-        from importlib.metadata import version
-
-        print(f"cdpr {version('cdpr')}")
+        print(f"cdpr {cdpr.__version__}")
         raise typer.Exit
 
 

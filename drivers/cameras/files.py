@@ -14,11 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import SPLIT, Frame, Image, eight_bits
+from drivers.cameras.live import Frame, FrameSource, Image, eight_bits
 from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import (
     IMAGE_LIMIT,
+    SPLIT,
     exif_orientation,
     files_in,
     is_folder,
@@ -35,7 +36,7 @@ _ON_ITS_SIDE = range(5, 9)  # EXIF orientations that swap width and height
 _NO_IMAGE, _CAMERA = "is not a readable image", "the camera has"
 
 
-class ImageFolder:
+class ImageFolder(FrameSource):
     """The images of a folder in natural order of their names.
 
     They are rotated by the rule of `read_image`, as in a calibration.

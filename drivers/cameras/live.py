@@ -11,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import cv2
 import numpy as np
@@ -23,7 +24,7 @@ from model.errors import (
     StoppedByOperator,
     without_passwords,
 )
-from model.files.reading import IMAGE_LIMIT, MOST_PIXELS, page_count, read_bytes
+from model.files.reading import MOST_PIXELS, require_one_page
 from model.rig import Camera
 
 # The newest image of a camera that delivers them faster than they are used.
@@ -150,8 +151,6 @@ def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
 
 
 Image = NDArray[np.uint8]
-SPLIT = "save each image as a file of its own"
-"""Next step for a file of several images."""
 LAST_CAMERA = 255
 """Largest camera index on Linux; OpenCV takes larger numbers as ports of other drivers."""
 
@@ -174,7 +173,20 @@ class Frame:
     number: int = 0
 
 
-class VideoFile:
+class FrameSource:
+    """Images of one camera; a context manager that closes them."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Releases what stays open between images: nothing for files."""
+
+
+class VideoFile(FrameSource):
     """The images of a video file.
 
     Args:
@@ -194,7 +206,7 @@ class VideoFile:
             raise BadInput("no such file", where=str(path), next_step="check the path")
         self._path, self._camera = path, camera
         if path.suffix.lower() in (".tif", ".tiff"):
-            _refuse_pages(path)
+            require_one_page(path)
         capture = _opened_video(path, camera)
         if not capture.isOpened():
             raise BadInput(
@@ -256,7 +268,7 @@ class VideoFile:
             raise BadInput("the video has no readable image", where=str(self._path))
 
 
-class LiveCamera:
+class LiveCamera(FrameSource):
     """A local or network camera that returns its newest image.
 
     Args:
@@ -302,12 +314,6 @@ class LiveCamera:
         except BaseException:
             self.close()
             raise
-
-    def __enter__(self) -> LiveCamera:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __iter__(self) -> Iterator[Frame]:
         """Yields images until stopped; those that arrive during processing are skipped.
@@ -374,13 +380,6 @@ def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
             why="the image is from another camera, or was cropped or scaled",
             next_step="use full-size images of this camera, or calibrate it at this size",
         )
-
-
-def _refuse_pages(path: Path) -> None:
-    """Refuses a TIFF file of several images, of which OpenCV reads the first as a video."""
-    if (pages := page_count(read_bytes(path, IMAGE_LIMIT))) > 1:
-        what = f"the file has {pages} pages"
-        raise BadInput(what, where=str(path), next_step=f"{SPLIT}, and name their folder")
 
 
 def video_size(path: Path) -> tuple[int, int]:

@@ -37,6 +37,9 @@ from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene, empty_scene, scene_from_document
 from tracking.measurement import MOST_TURN, Observation
 
+#: Rate of progress reports without a camera, [Hz].
+PROGRESS_RATE = 10.0
+
 if TYPE_CHECKING:  # a real camera loads no simulator, and its process no planner
     from executor.trajectory.setpoints import PreparedRun
     from simulation.camera.camera import ImageSequence
@@ -123,8 +126,8 @@ def report_unmeasured_rotation(rig: Rig, rotations: Array, listener: Listener) -
 
 
 def asked_rate(sources: Mapping[Camera, str]) -> float:
-    """Common frame rate of the cameras: that of the slowest, [Hz]."""
-    return min(camera.rate for camera in sources)
+    """Common frame rate of the cameras, [Hz]: that of the slowest, or of progress without any."""
+    return min((camera.rate for camera in sources), default=PROGRESS_RATE)
 
 
 def require_no_stop(board: RequestBoard) -> None:

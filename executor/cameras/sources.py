@@ -14,7 +14,9 @@ from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
 
-CameraChoice = str | int | Sequence[str | int] | Mapping[str, str | int] | None
+OneCamera = str | int | Path
+"""Image source of a live camera: its index, device file or address; or ``NAME=SOURCE``."""
+CameraChoice = OneCamera | Sequence[OneCamera] | Mapping[str, OneCamera] | None
 """``synthetic`` for all cameras of the rig file, one source, ``NAME=SOURCE`` for each of several, a
 mapping from names to sources, an empty one for no camera; None for the default: all synthetic where
 the drives are simulated in this process, an error on a bus."""
@@ -116,12 +118,25 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
     """
     if wanted is None:
         return choose_cameras(rig, [], False, in_process)
-    if isinstance(wanted, str | int | np.integer):
-        return choose_cameras(rig, [str(wanted)], False, in_process)
     if isinstance(wanted, Mapping):
         wanted = [f"{name}={source}" for name, source in wanted.items()]
-    sources = [str(source) for source in sequence_of("cameras", wanted)]
+    sources = source_texts("cameras", wanted)
     return choose_cameras(rig, sources, not sources, in_process)
+
+
+def source_texts(name: str, wanted: OneCamera | Sequence[OneCamera]) -> list[str]:
+    """One source or several, as texts.
+
+    Args:
+        name: Of the argument, for messages.
+        wanted: As the caller gave it.
+
+    Raises:
+        BadInput: It is neither.
+    """
+    if isinstance(wanted, str | int | Path | np.integer):
+        return [str(wanted)]
+    return [str(source) for source in sequence_of(name, wanted)]
 
 
 def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Camera, str]:

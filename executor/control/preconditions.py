@@ -98,8 +98,9 @@ def require_at_start(checked: CheckedSetpoints, actual: Array) -> None:
             f" {off[worst] * 1000:.1f} mm off, limit {rig.motion.start_tolerance * 1000:.1f} mm",
             where="arming",
             why="the platform was moved, or the drives were not homed",
-            next_step="move the platform to the plan's start (plan a path from its pose"
-            " with `cdpr plan --start-mm`), or home the drives; nothing was enabled",
+            next_step="move the platform to the plan's start (plan a path from its pose with"
+            " `cdpr plan --start-mm`, in Python cdpr.plan(start=)), or home the drives; nothing was"
+            " enabled",
             values={"off_mm": float(off[worst] * 1000), "cable": float(worst + 1)},
         )
 

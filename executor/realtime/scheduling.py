@@ -283,8 +283,8 @@ def require_real_time(denied: str, *, needed: bool) -> None:
             f"no real-time scheduling: {denied}",
             where="arming",
             why="without it other programs delay cycles, and late cycles stop the motion",
-            next_step="allow it as stated above, or pass --without-real-time to accept that;"
-            " nothing was enabled",
+            next_step="allow it as stated above, or accept that with --without-real-time, in Python"
+            " need_real_time_rights=False; nothing was enabled",
         )
 
 

@@ -154,8 +154,7 @@ def _unknown(what: str, where: str) -> Refused:
         f"the platform pose is unknown: {what}",
         where=where,
         why="a drive slipped, stalled or was lost, or the run was killed",
-        next_step="check the rig, home the drives, and plan from the platform's pose with"
-        " `cdpr plan --start-mm`",
+        next_step="check the rig, home the drives, and plan from the platform's pose with `start=`",
     )
 
 

@@ -165,7 +165,7 @@ def select_run(runs: Sequence[RunConnection], process: int | None, verb: str) ->
         raise BadInput(
             f"{len(runs)} runs are in progress",
             where=f"cdpr {verb}",
-            next_step=f"name one with --process: {numbers}",
+            next_step=f"name one with `process=`: {numbers}",
         )
     if found:
         raise BadInput(

@@ -353,6 +353,21 @@ def page_count(data: bytes) -> int:
     return max(1, sizes.count(sizes[0])) if sizes else 1
 
 
+SPLIT = "save each image as a file of its own"
+"""Next step for a file of several images."""
+
+
+def require_one_page(path: Path) -> None:
+    """Requires at most one image in a TIFF file, of which OpenCV reads the first as a video.
+
+    Raises:
+        BadInput: It cannot be read, or has several.
+    """
+    if (pages := page_count(read_bytes(path, IMAGE_LIMIT))) > 1:
+        what = f"the file has {pages} pages"
+        raise BadInput(what, where=str(path), next_step=f"{SPLIT}, and name their folder")
+
+
 def exif_orientation(data: bytes) -> int:
     """The orientation in a JPEG file's EXIF data, 1 to 8; 1 if it states none."""
     tiff = data[: 2 * _EXIF_WITHIN].partition(b"Exif\0\0")[2]

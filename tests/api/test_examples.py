@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import re
 import runpy
@@ -13,6 +14,7 @@ from typing import Any
 
 import matplotlib as mpl
 import pytest
+from matplotlib.figure import Figure
 
 import cdpr
 from tests.cli.plans import CONFIGS, rig_for_long_runs
@@ -110,7 +112,18 @@ def test_a_notebook_runs_from_top_to_bottom(notebook: Path, elsewhere: Path) -> 
     assert [cell for cell in code if cell["outputs"] or cell["execution_count"]] == []
     names: dict[str, Any] = {"__name__": "__main__"}
     for number, cell in enumerate(code):
-        exec(compile("".join(cell["source"]), f"{notebook.name}, cell {number}", "exec"), names)
+        source, where = "".join(cell["source"]), f"{notebook.name}, cell {number}"
+        shown = run_cell(source, where, names)
+        # Jupyter shows new figures itself; one that the cell returns would appear twice.
+        assert source.endswith(";") == isinstance(shown, Figure), where
+
+
+def run_cell(source: str, where: str, names: dict[str, Any]) -> object:
+    """The value of a cell's last expression, which a notebook shows unless it ends with `;`."""
+    statements = ast.parse(source).body
+    last = statements.pop() if isinstance(statements[-1], ast.Expr) else None
+    exec(compile(ast.Module(statements, []), where, "exec"), names)
+    return last and eval(compile(ast.Expression(last.value), where, "eval"), names)
 
 
 def test_the_python_of_the_readme_runs(elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:

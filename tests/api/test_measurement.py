@@ -94,6 +94,8 @@ def test_a_source_of_images_is_opened_by_what_it_is(rig: cdpr.Rig) -> None:
     images = cdpr.open_camera(rig, SESSION / "pictures", "front")
     assert isinstance(images, ImageFolder)
     assert next(iter(images)).name == "place_01.jpg"
+    with cdpr.open_camera(rig, SESSION / "pictures") as opened:
+        assert len(list(islice(opened, 2))) == 2
     with pytest.raises(cdpr.BadInput):
         cdpr.open_camera(rig, str(SESSION / "no-such-folder"))
 

@@ -7,6 +7,7 @@ import importlib
 import inspect
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -92,6 +93,20 @@ def test_a_file_that_hides_a_package_is_named(tmp_path: Path, file: str, code: s
     assert answer.returncode == 1
     last = f"ImportError: {tmp_path / file} hides the package `{name}` of cdpr: rename it"
     assert answer.stderr.splitlines()[-1] == last
+
+
+@pytest.mark.parametrize(
+    ("function", "words"),
+    [
+        (cdpr.run, ("``[]`` for none", '``{"front": 0}``', '``"synthetic"``', "None for all")),
+        (cdpr.home, ("device file or address", "``NAME=SOURCE``", "``synthetic``")),
+    ],
+)
+def test_the_help_states_which_cameras_are_taken(
+    function: Callable[..., object], words: tuple[str, ...]
+) -> None:
+    shown = " ".join(inspect.getdoc(function).split())
+    assert [word for word in words if word not in shown] == []
 
 
 def test_every_public_name_is_documented() -> None:

@@ -697,11 +697,14 @@ def test_messages_of_the_library_name_what_a_script_passes(rig: cdpr.Rig) -> Non
         cdpr.status(rig)
     with pytest.raises(cdpr.BadInput, match="exactly one") as unknown:
         cdpr.home(rig)
+    with pytest.raises(cdpr.Refused, match=r"a jog of 60\.0 mm") as far:
+        cdpr.jog(rig, None, by=[0.0, 0.0, 0.06])
     for caught, option, argument in (
         (without, "--no-camera", "cameras=[]"),
         (unnamed, "--camera INDEX", "cameras=INDEX"),
         (virtual, "--interface", "rig.with_bus"),
         (unknown, "--at-home", "at_home=True"),
+        (far, "cdpr plan --start-mm", "cdpr.plan(start=)"),
     ):
         assert option in caught.value.next_step
         assert argument in caught.value.next_step

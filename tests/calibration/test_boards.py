@@ -171,7 +171,7 @@ def test_the_order_of_kalibr_is_named_where_the_numbers_contradict_the_rows() ->
     rows = replace(KALIBR, order="rows")
     with pytest.raises(BadInput) as caught:
         fit_camera([(f"{k}", image) for k, image in enumerate(shown)], rows)
-    assert "rows upward, as Kalibr prints them: try --order kalibr" in caught.value.why
+    assert "rows upward, as Kalibr prints them: try `order='kalibr'`" in caught.value.why
 
 
 def test_own_tags_in_the_order_of_kalibr_are_rejected() -> None:
@@ -180,7 +180,7 @@ def test_own_tags_in_the_order_of_kalibr_are_rejected() -> None:
     assert whole
     for _, image in whole:
         assert other.find(image) is None
-        assert "--order rows" in other.describe_other(image)
+        assert "`order='rows'`" in other.describe_other(image)
 
 
 def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
@@ -189,7 +189,7 @@ def test_a_charuco_board_of_an_old_opencv_is_named() -> None:
     drawn.setLegacyPattern(True)
     image = cv2.copyMakeBorder(drawn.generateImage((400, 480)), 40, 40, 40, 40, 0, value=255)
     assert Charuco(5, 6, 0.040, 0.030, "4X4_50", legacy=True).find(image) is not None
-    assert "try with --legacy" in Charuco(5, 6, 0.040, 0.030, "4X4_50").describe_other(image)
+    assert "try with `legacy=True`" in Charuco(5, 6, 0.040, 0.030, "4X4_50").describe_other(image)
 
 
 @cache
@@ -367,12 +367,12 @@ def whole_pictures(board: Charuco | TagGrid, least: int) -> list[tuple[str, np.n
 @pytest.mark.parametrize(
     ("wrong", "advice"),
     [
-        ({"first": 21}, "fit a grid of 5 x 4 tags, tag36h11 20 to 39: try --first 20;"),
-        ({"first": 18}, "try --first 20;"),
-        ({"columns": 6}, "fit a grid of 5 x 4 tags, tag36h11 20 to 39: try --columns 5;"),
-        ({"columns": 4}, "try --columns 5;"),
-        ({"columns": 4, "rows": 3, "first": 22}, "try --columns 5 --rows 4 --first 20;"),
-        ({"columns": 6, "order": "kalibr"}, "try --columns 5 --order rows;"),
+        ({"first": 21}, "fit a grid of 5 x 4 tags, tag36h11 20 to 39: try `first=20`;"),
+        ({"first": 18}, "try `first=20`;"),
+        ({"columns": 6}, "fit a grid of 5 x 4 tags, tag36h11 20 to 39: try `columns=5`;"),
+        ({"columns": 4}, "try `columns=5`;"),
+        ({"columns": 4, "rows": 3, "first": 22}, "try `columns=5` `rows=4` `first=20`;"),
+        ({"columns": 6, "order": "kalibr"}, "try `columns=5` `order='rows'`;"),
     ],
 )
 def test_tags_numbered_otherwise_are_named(wrong: dict[str, int], advice: str) -> None:
@@ -429,7 +429,10 @@ def test_a_wrong_gap_between_tags_is_named_with_the_right_one(gap_mm: float) -> 
     )
     assert found is not None, verdict.reasons
     assert float(found[1]) == pytest.approx(12.0, abs=0.1)
-    assert verdict.next_steps[0] == "measure the print, and correct --tag-mm or --gap-mm"
+    assert (
+        verdict.next_steps[0]
+        == "measure the print, and correct --tag-mm or --gap-mm, in Python tag= or gap="
+    )
 
 
 def test_right_sizes_of_a_board_are_not_questioned() -> None:
@@ -446,7 +449,9 @@ def test_a_wrong_size_of_markers_is_named(marker_mm: float, capfd) -> None:
     wrong = replace(CHARUCO, marker=marker_mm / 1e3)
     verdict = calibrate_camera(ImageSet(images, len(images)), wrong, lens="five").quality.verdict
     assert re.search(r"markers of about (29|30) mm in squares of 40 mm", str(verdict.reasons))
-    assert verdict.next_steps[0].endswith("--square-mm or --marker-mm")
+    assert verdict.next_steps[0].endswith(
+        "--square-mm or --marker-mm, in Python square= or marker="
+    )
     assert capfd.readouterr().err == ""
 
 
@@ -454,7 +459,7 @@ def test_rows_and_columns_of_a_charuco_board_exchanged_are_named() -> None:
     image = whole_pictures(CHARUCO, 16)[0][1]
     exchanged = replace(CHARUCO, columns=5, rows=7)
     assert exchanged.find(image) is None
-    assert "7 x 5 squares with 4X4_50: try --columns 7 --rows 5" in exchanged.describe_other(image)
+    assert "7 x 5 squares with 4X4_50: try `columns=7` `rows=5`" in exchanged.describe_other(image)
 
 
 def test_images_that_can_be_read_only_once_are_refused() -> None:

@@ -471,7 +471,7 @@ def test_an_error_that_the_plans_own_rig_lacks_is_stated_in_the_file_that_is_pas
     rig.write_text(text, encoding="utf-8")
     with nothing_written(tmp_path):
         answer = call("run", file, "--fast", "-o", tmp_path / "run")
-    one_message(answer, 2, "camera 'front' is unknown", "then plan again, or pass --rig FILE")
+    one_message(answer, 2, "camera 'front' is unknown", "then plan again, or pass --rig: a plan")
     with nothing_written(tmp_path):
         answer = call("run", file, "--fast", "--rig", rig, "-o", tmp_path / "run")
     assert "is unknown" not in answer.err

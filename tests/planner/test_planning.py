@@ -325,6 +325,7 @@ def test_the_clearance_of_an_obstacle_is_named_as_every_verb_takes_it(gachon, sc
     with pytest.raises(BadInput, match=r"at the start .* block") as refusal:
         require_usable_ends(gachon, scene_with(block, clearance={"obstacle_mm": 100.0}))
     assert "clearance.obstacle_mm, or --clearance-mm of `cdpr plan`" in refusal.value.why
+    assert "in Python clearance=," in refusal.value.why
 
 
 def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_with) -> None:

@@ -76,6 +76,62 @@ def problem(command: str) -> str:
     return f"no option {sorted(wanted - known)}" if wanted - known else ""
 
 
+OPTION = re.compile(r"(?<![\w-])(?<!var\()--[a-z]")
+#: Modules of the library with options that have no Python form, and why.
+ONLY_TYPED = {
+    "calibration/extrinsics/camera_pairs.py": "--board",
+    "calibration/images.py": "--live and --rate-hz",
+    "calibration/intrinsics/exchange.py": "calibrate export and import",
+    "calibration/targets/printing.py": "calibrate print",
+    "drivers/plausibility.py": "part of the command `cdpr home`",
+    "executor/cameras/sources.py": "--camera and --no-camera together",
+    "executor/doctor.py": "options of pip, and --drives",
+    "model/files/documents.py": "--help",
+    "model/files/output.py": "--force",
+    "model/pages/viewer.py": "properties of a style sheet",
+    "model/plan.py": "--rounds in a fact that the command line shows",
+    "planner/parallel.py": "--dask",
+    "planner/workspace/grid.py": "--slice",
+    "simulation/drives/behaviour.py": "cdpr sim",
+    "simulation/drives/eds_file.py": "cdpr sim",
+    "simulation/factory.py": "cdpr sim",
+}
+
+
+def without_docstrings(source: str) -> ast.AST:
+    """A module without the texts that only stand there."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+            node.value = ast.Constant(None)
+    return tree
+
+
+def options_alone(source: str) -> list[str]:
+    """Messages with an option outside a whole command, and without its Python form."""
+    said = (re.sub("`cdpr [^`]*`", "", text) for text in texts(without_docstrings(source)))
+    return [text for text in said if OPTION.search(text) and "in Python" not in text]
+
+
+def test_a_message_of_the_library_that_names_an_option_names_its_python_form() -> None:
+    """Arguments such as `budget=` are shown as options; where that cannot be, it names both."""
+    library = [
+        p for package in PACKAGES if package != "cdpr" for p in (ROOT / package).rglob("*.py")
+    ]
+    found = {
+        str(path.relative_to(ROOT)): alone
+        for path in (*library, *(ROOT / "cdpr").glob("*.py"))
+        if (alone := options_alone(path.read_text()))
+    }
+    assert {name: alone for name, alone in found.items() if name not in ONLY_TYPED} == {}
+    assert found.keys() == ONLY_TYPED.keys()
+
+
+def test_an_option_alone_is_found() -> None:
+    assert options_alone('def f():\n    """Of --a."""\n    return f"{x}, or pass --b-mm"') != []
+    assert options_alone('"""Of --a."""\ns = "`cdpr plan --b`", "pass --c, in Python c="') == []
+
+
 PAGE = re.compile(r"docs/[\w/-]+\.md")
 RELATIVE = {
     "cdpr/cli/calibrate/rig.py": "a help text: `cdpr --help` states where docs/ is",

@@ -17,6 +17,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
+import cdpr
 from tests.cli.program import call
 from tools.wheel import (
     Failed,
@@ -112,6 +113,7 @@ def test_the_import_contracts_are_kept() -> None:
 def test_the_version_is_the_same_wherever_it_is_written() -> None:
     version = PROJECT["project"]["version"]
     assert call("--version").out == f"cdpr {version}\n"
+    assert cdpr.__version__ == version
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == version
     headings = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
     released = [Version(heading) for heading in headings if heading != "Unreleased"]

@@ -21,7 +21,7 @@ CIRCLES: list[list[str]] = []
 #: Modules that import inside functions, by the reason; all others import at their top.
 INNER_IMPORTS: dict[str, set[str]] = {
     "a heavy library is loaded by the few calls that need it": {
-        "cdpr/cli/app.py",
+        "cdpr/__init__.py",
         "cdpr/console/watch.py",
         "executor/cameras/process.py",
         "executor/recording/run_folder.py",

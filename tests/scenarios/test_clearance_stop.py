@@ -116,7 +116,7 @@ def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
     answer = call("run", narrow_plan, *arguments)
     assert answer.code == 1, answer
     summary = RunFolder.open(run).summary()
-    assert "off (--no-clearance-stop)" in answer.out
+    assert "off (--no-clearance-stop, in Python clearance_stop=False)" in answer.out
     assert summary["final_state"] != "stopped"
     assert "clearance_low" not in list(events_of(run))
     assert "clearance_tag" in [c["name"] for c in summary["checks"] if not c["passed"]]

@@ -167,6 +167,15 @@ def test_cameras_are_chosen_as_they_are_named(
     assert {camera.name: source for camera, source in eyes.items()} == chosen
 
 
+@pytest.mark.parametrize("several", [lambda s: s, lambda s: [s], lambda s: {"front": s}])
+def test_a_device_is_named_by_its_path_or_by_a_text(rig_file: Path, several: Any) -> None:
+    device, rig = Path("/dev/video9"), load_rig(rig_file)
+    by_text = resolve_cameras(rig, several(str(device)), in_process=False)
+    assert resolve_cameras(rig, several(device), in_process=False) == by_text
+    with pytest.raises(BadInput, match="state the platform pose by exactly one"):
+        home(rig, at_home=True, camera=device)
+
+
 @pytest.mark.parametrize("wanted", [1, np.int64(1), [np.int64(1)], {"front": np.int64(1)}])
 def test_a_camera_is_named_by_an_integer_of_any_type(rig_file: Path, wanted: Any) -> None:
     eyes = resolve_cameras(load_rig(rig_file), wanted, in_process=True)
