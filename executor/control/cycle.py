@@ -172,6 +172,7 @@ class Cycle:
         armed: The hash of the set-points was confirmed, and the platform is at their start.
         latched: A fault is latched.
         targets: Last set-points sent; None before the first.
+        index: Table index of the last set-points sent from a table.
         actual: Positions as last received, [counts].
     """
 
@@ -192,6 +193,7 @@ class Cycle:
         self.latched = False
         self._unsent = 0.0
         self.targets: tuple[int, ...] | None = None
+        self.index = 0.0
         self.actual: tuple[int, ...] = ()
 
     @property
@@ -234,13 +236,21 @@ class Cycle:
             self.targets = held
         return verdict
 
-    def cycle(self, purpose: Purpose, targets: tuple[int, ...], *, at_rest: bool) -> CycleResult:
+    def cycle(
+        self,
+        purpose: Purpose,
+        targets: tuple[int, ...],
+        *,
+        at_rest: bool,
+        index: float | None = None,
+    ) -> CycleResult:
         """One cycle.
 
         Args:
             purpose: Purpose of the targets.
             targets: One position per drive, [counts].
             at_rest: Nothing moves: only a cycle that would enable a drive can be late.
+            index: Of the targets in a table; None if they are not from one, or those sent before.
         """
         # A cycle that was not sent has no record: the next one records its lateness.
         lateness, self._unsent = max(self._master.begin(), self._unsent), 0.0
@@ -251,8 +261,12 @@ class Cycle:
         verdict = self.allows(purpose, targets)
         if not verdict.allowed:
             return CycleResult(verdict, lateness)
-        status = self._master.exchange(targets)
-        self.targets = targets
+        try:
+            status = self._master.exchange(targets)
+        finally:  # a fault of the bus may be found after the drives got the set-points
+            if self._master.sent:
+                self.targets = targets
+                self.index = self.index if index is None else index
         self.actual = tuple(int(p) for p in status.positions)
         errors = self._following_errors(status)
         overdue = self._master.overdue

@@ -166,10 +166,13 @@ class RunLog:
 
     def _reported_index(self, cycles: Cycles, first: int) -> Array:
         """Table index whose set-points the drives followed when they reported their positions."""
+        sent = np.asarray(cycles["index"], dtype=np.float64)
         if not self._delay:
-            return np.asarray(cycles["index"], dtype=np.float64)
+            return sent
         before = self._cycles(first - 1, first)["index"] if first else [0.0]
-        return np.concatenate([before, cycles["index"][:-1]])[: len(cycles)]
+        earlier = np.concatenate([before, sent[:-1]])[: len(cycles)]
+        # A stop sends no further row; a bus fault leaves no record of the cycle that sent the last.
+        return np.where(cycles["state"] == _STATES.index(State.LATCHED), sent, earlier)
 
     def _lengths(self, cycles: Cycles, rows: Integers) -> tuple[Array, Array, Array]:
         """Cable lengths, tensions where torques give them, and how far lengths may be off a pose.
