@@ -257,6 +257,7 @@ class Loop:
             error_frames=done.status.error_frames,
             following_error=done.following_error,
             lateness=done.lateness,
+            tension_known=done.tension_known,
             press=self._press,
         )
         self._cycle += 1
@@ -345,6 +346,7 @@ class Loop:
             self._feed.stop()
             at_rest = self.machine.state is State.SECURING or self._feed.at_rest
             self._note_cause(f"{alarm.text}; {'at rest' if at_rest else self._path_stop}")
+            self._sender.faulted = True
             self.machine.on(Event.PATH_FAULT)
 
     def _needs_quick_stop(self, alarm: Alarm) -> bool:
