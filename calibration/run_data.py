@@ -141,7 +141,7 @@ def _at_rest(run: Path) -> RigMeasurements:
             time=cycles.time,
             setpoints=cycles.set_counts.astype(np.float64),
             counts=cycles.actual_counts.astype(np.float64),
-            tensions=cycles.tensions,
+            tensions=cycles.following_tensions,
             pose_times=poses.time[good],
             positions=poses.position[good],
             rotations=np.array(rotations).reshape(-1, 3, 3),

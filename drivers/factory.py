@@ -12,7 +12,7 @@ from typing import Literal
 
 import can
 
-from drivers.drive_group import DriveGroup, DriveSnapshot, Pump
+from drivers.drive_group import CycleStatus, DriveGroup, DriveSnapshot, Pump
 from model.rig import Rig
 
 STOPS_ALONE_WITHIN = 1.0
@@ -111,6 +111,13 @@ def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
 
     rows = zip(rig.winches, status_words, strict=True)
     return tuple(winch.node_id for winch, word in rows if state_of(word) not in HOLDS)
+
+
+def holding_nodes(rig: Rig, status: CycleStatus) -> set[int]:
+    """Nodes that hold by torque; those of ODrives hold by brakes, all or none."""
+    released = without_torque(rig, status.status_words.tolist())
+    nodes = {*rig.drive_names} if status.holding or released else set[int]()
+    return nodes.difference(released)
 
 
 def may_have_released(rig: Rig, missing: Sequence[bool]) -> tuple[int, ...]:

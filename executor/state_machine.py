@@ -143,6 +143,8 @@ class CycleRecord:
         error_frames: Error frames of the bus since then.
         following_error: Largest of the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
+        tension_known: Whether the torque of each drive measures the tension of its cable: it
+            answered, and follows set-points or, after a fault, holds under torque.
         press: Of a jog, whose line ``index`` belongs to; 0 before the first, and in other motions.
     """
 
@@ -160,6 +162,7 @@ class CycleRecord:
     error_frames: int
     following_error: float
     lateness: float
+    tension_known: tuple[bool, ...]
     press: int = 0
 
 

@@ -277,7 +277,7 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
             unused[sample] = "no image taken there gave a pose"
             continue
         names.append(sample)
-        means = (run.counts[cycles].mean(axis=0), run.tensions[cycles].mean(axis=0))
+        means = (run.counts[cycles].mean(axis=0), _mean_tensions(run.tensions[cycles]))
         rows.append((*means, *_mean_pose(run, pictures)))
     m = run.counts.shape[1]
     shapes = ((-1, m), (-1, m), (-1, 3), (-1, 3, 3), (-1, 6, 6))
@@ -293,6 +293,13 @@ def _rests(time: Array, still: NDArray[np.bool_]) -> list[tuple[float, float]]:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8)))
     found = [(time[a], time[b]) for a, b in zip(edges[::2], edges[1::2], strict=True)]
     return [(a + SETTLING, b) for a, b in found if b - a >= SHORTEST_REST]
+
+
+def _mean_tensions(tensions: Array) -> Array:
+    """Means of the cycles in which all drives answered; NaN without one."""
+    known = tensions[np.isfinite(tensions).all(axis=1)]
+    means: Array = known.mean(axis=0) if len(known) else np.full(tensions.shape[1], np.nan)
+    return means
 
 
 def _mean_pose(run: Recording, pictures: NDArray[np.bool_]) -> tuple[Array, Array, Array]:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.drive_group import CycleStatus, GroupState
+from drivers.factory import without_torque
 from executor.control.sync_master import SyncMaster
 from executor.safety.fault_messages import Alarm, StopReaction
 from executor.safety.gate import ALLOWED, GateDecision, Purpose, Request, examine
@@ -156,6 +157,7 @@ class CycleResult:
         following_error: Largest of the cables, [m]; NaN while the drives do not follow.
         lateness: In cycles.
         alarms: What the monitors found.
+        tension_known: See `CycleRecord`.
     """
 
     verdict: GateDecision
@@ -163,6 +165,7 @@ class CycleResult:
     status: CycleStatus | None = None
     following_error: float = float("nan")
     alarms: tuple[Alarm, ...] = ()
+    tension_known: tuple[bool, ...] = ()
 
 
 class Cycle:
@@ -171,7 +174,9 @@ class Cycle:
     Attributes:
         armed: The hash of the set-points was confirmed, and the platform is at their start.
         latched: A fault is latched.
+        faulted: A fault stopped the motion along its path.
         targets: Last set-points sent; None before the first.
+        index: Table index of the last set-points sent from a table.
         actual: Positions as last received, [counts].
     """
 
@@ -189,9 +194,10 @@ class Cycle:
         self._watch = Monitor.fresh(limits, names)
         self._stuck = StuckWatch.fresh(stuck_limits(rig, checked.cycle), names)
         self.armed = False
-        self.latched = False
+        self.latched = self.faulted = False
         self._unsent = 0.0
         self.targets: tuple[int, ...] | None = None
+        self.index = 0.0
         self.actual: tuple[int, ...] = ()
 
     @property
@@ -234,13 +240,21 @@ class Cycle:
             self.targets = held
         return verdict
 
-    def cycle(self, purpose: Purpose, targets: tuple[int, ...], *, at_rest: bool) -> CycleResult:
+    def cycle(
+        self,
+        purpose: Purpose,
+        targets: tuple[int, ...],
+        *,
+        at_rest: bool,
+        index: float | None = None,
+    ) -> CycleResult:
         """One cycle.
 
         Args:
             purpose: Purpose of the targets.
             targets: One position per drive, [counts].
             at_rest: Nothing moves: only a cycle that would enable a drive can be late.
+            index: Of the targets in a table; None if they are not from one, or those sent before.
         """
         # A cycle that was not sent has no record: the next one records its lateness.
         lateness, self._unsent = max(self._master.begin(), self._unsent), 0.0
@@ -251,14 +265,19 @@ class Cycle:
         verdict = self.allows(purpose, targets)
         if not verdict.allowed:
             return CycleResult(verdict, lateness)
-        status = self._master.exchange(targets)
-        self.targets = targets
+        try:
+            status = self._master.exchange(targets)
+        finally:  # a fault of the bus may be found after the drives got the set-points
+            if self._master.sent:
+                self.targets = targets
+                self.index = self.index if index is None else index
         self.actual = tuple(int(p) for p in status.positions)
         errors = self._following_errors(status)
         overdue = self._master.overdue
         lateness = max(lateness, overdue - 1.0)
         alarms = self._evaluate(status, errors, 0.0 if at_rest and not overdue else lateness)
-        return CycleResult(verdict, lateness, status, _largest(errors), alarms)
+        known = self._tension_known(status)
+        return CycleResult(verdict, lateness, status, _largest(errors), alarms, known)
 
     def _too_late(self, lateness: float) -> tuple[Alarm, ...]:
         """Quick-stop alarms of a cycle so late that drives may have stopped on their own."""
@@ -271,6 +290,17 @@ class Cycle:
             return np.full(len(self._per_metre), np.nan)
         errors: Array = (status.positions - status.demands) / self._per_metre
         return np.where(status.missing, np.nan, errors)
+
+    def _tension_known(self, status: CycleStatus) -> tuple[bool, ...]:
+        """See `CycleRecord`; after a fault the states of ODrives lag behind their torques."""
+        if status.state is GroupState.ENABLED:
+            return tuple((~status.missing).tolist())
+        faulted = self.latched or self.faulted or status.state is GroupState.FAULT
+        if not (faulted and self._group.capabilities.holds_on_quick_stop):
+            return (False,) * len(status.missing)
+        released = without_torque(self._rig, status.status_words.tolist())
+        holds = (node not in released for node in self._rig.drive_names)
+        return tuple(h and not m for h, m in zip(holds, status.missing.tolist(), strict=True))
 
     def _evaluate(self, status: CycleStatus, errors: Array, lateness: float) -> tuple[Alarm, ...]:
         following, missing = status.state is GroupState.ENABLED, status.missing.tolist()

@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import may_have_released, stop_alone, without_torque
+from drivers.factory import holding_nodes, may_have_released, stop_alone
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_checked
 from executor.control.sync_master import SyncMaster, changed_states
@@ -89,7 +89,7 @@ class Loop:
         seen = self._master.read_positions()
         self._master.require_no_fault()
         require(seen)
-        self._held_before = self._nodes_holding(seen)
+        self._held_before = holding_nodes(self._rig, seen)
         self._require_at_start()
         self._sender.armed = True
 
@@ -176,8 +176,8 @@ class Loop:
     def _follow(self) -> None:
         """One cycle along the table, or at rest in it."""
         if not self._feed.at_rest:
-            targets = targets_at(self._checked.setpoints, self._feed.advance())
-            self._send(Purpose.MOVE, targets)
+            index = self._feed.advance()
+            self._send(Purpose.MOVE, targets_at(self._checked.setpoints, index), index)
         elif self.machine.state is State.HOLDING:
             self._send(Purpose.HOLD, self._sender.resting_targets)
         else:
@@ -219,10 +219,12 @@ class Loop:
         self._send(Purpose.HOLD, self._sender.resting_targets)
         return self.machine.state is State.SECURING
 
-    def _send(self, purpose: Purpose, targets: tuple[int, ...]) -> CycleStatus | None:
+    def _send(
+        self, purpose: Purpose, targets: tuple[int, ...], index: float | None = None
+    ) -> CycleStatus | None:
         """Sends one cycle and reacts to its result; None when the gate denied the targets."""
         at_rest = self.machine.state in (State.ENABLING, State.SECURING)
-        done = self._sender.cycle(purpose, targets, at_rest=at_rest)
+        done = self._sender.cycle(purpose, targets, at_rest=at_rest, index=index)
         if not done.verdict.allowed:
             self._fault("gate_denied", f"the safety gate denied a set-point: {done.verdict.reason}")
             return None
@@ -255,6 +257,7 @@ class Loop:
             error_frames=done.status.error_frames,
             following_error=done.following_error,
             lateness=done.lateness,
+            tension_known=done.tension_known,
             press=self._press,
         )
         self._cycle += 1
@@ -262,15 +265,9 @@ class Loop:
 
     def _is_held(self, status: CycleStatus) -> bool:
         """Whether no drive has let go of a cable that it held, before or in this motion."""
-        holding = self._nodes_holding(status)
+        holding = holding_nodes(self._rig, status)
         self._held_before |= holding
         return holding == self._held_before
-
-    def _nodes_holding(self, status: CycleStatus) -> set[int]:
-        """Nodes that hold by torque; those of ODrives hold by brakes, all or none."""
-        released = without_torque(self._rig, status.status_words.tolist())
-        nodes = {*self._rig.drive_names} if status.holding or released else set[int]()
-        return nodes.difference(released)
 
     def _note_end(self, left: CycleStatus | None) -> None:
         """Notes whether every cable is still held; None where no drive could be read."""
@@ -279,8 +276,8 @@ class Loop:
         self.holding = held and self._held_before.isdisjoint(may_have_released(self._rig, silent))
 
     def _index(self) -> float:
-        """Progress of the motion, for the record."""
-        return self._feed.index
+        """Progress of the motion, for the record: only what was sent to the drives."""
+        return self._sender.index
 
     def _call_listener(self, call: Callable[[], None]) -> None:
         """A failing listener does not break the loop; it causes a path stop."""
@@ -349,6 +346,7 @@ class Loop:
             self._feed.stop()
             at_rest = self.machine.state is State.SECURING or self._feed.at_rest
             self._note_cause(f"{alarm.text}; {'at rest' if at_rest else self._path_stop}")
+            self._sender.faulted = True
             self.machine.on(Event.PATH_FAULT)
 
     def _needs_quick_stop(self, alarm: Alarm) -> bool:

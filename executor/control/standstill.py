@@ -149,6 +149,7 @@ class Standstill(ABC):
             error_frames=status.error_frames,
             following_error=float("nan"),
             lateness=lateness,
+            tension_known=(False,) * len(status.missing),
         )
         self._cycles += 1
         self._on_cycle(record)

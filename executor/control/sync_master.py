@@ -80,6 +80,7 @@ class SyncMaster:
         clock: Real or simulated.
         rule: Limit on the age of the last SYNC.
         status: Last report of the drives; None before the first reading.
+        sent: The frames of the last `exchange` were sent, whatever was found afterwards.
     """
 
     def __init__(self, rig: Rig, group: DriveGroup, clock: Clock) -> None:
@@ -88,6 +89,7 @@ class SyncMaster:
         timeout = group.capabilities.sync_timeout
         self.rule = SyncAge(USUAL_TIMEOUT if timeout is None else timeout)
         self.status: CycleStatus | None = None
+        self.sent = False
         self._rig, self._cycle = rig, rig.cycle
         self._synced: float | None = None
         self._overdue = 0.0
@@ -114,8 +116,9 @@ class SyncMaster:
         Raises:
             Fault: The bus failed.
         """
-        self._overdue, self._enabled_after = 0.0, None
+        self._overdue, self._enabled_after, self.sent = 0.0, None, False
         self.group.send_cycle(targets, self._may_send_now)
+        self.sent = True
         if self._enabled_after is not None:
             age = (self.clock.now - self._enabled_after) / self._cycle
             if not self.rule.may_enable(age):

@@ -76,7 +76,8 @@ class JogLoop(Loop):
         else:
             self._feed.go_to(self._rate(held.share))
         if not self._feed.at_rest:
-            self._send(Purpose.MOVE, targets_at(self._rows, self._feed.advance()))
+            index = self._feed.advance()
+            self._send(Purpose.MOVE, targets_at(self._rows, index), index)
         elif not moving or held.ends:
             self.machine.on(Event.AT_REST)
         else:
@@ -125,6 +126,7 @@ class JogLoop(Loop):
         rate = self._rate(share) if piece.from_rest else 0.0
         motion = self._rig.motion
         self._feed = Feed(len(self._rows), self._checked.cycle, motion, rate=rate)
+        self._sender.index = 0.0
         self._sender.allow(self._rows)
 
     def _apply_requests(self, requests: OperatorRequests) -> None:

@@ -165,7 +165,7 @@ class CycleRecordCodec:
     def __init__(self, cables: int) -> None:
         """A codec for this number of cables."""
         self._cables = cables
-        self._layout = struct.Struct(f"<Qd B dd HQQ ddQ {4 * cables}i 7d")
+        self._layout = struct.Struct(f"<Qd B dd HQQ ddQ {4 * cables}i {cables}? 7d")
         self.size = self._layout.size
 
     def pack(self, record: CycleRecord, pose: Pose | None) -> bytes:
@@ -187,6 +187,7 @@ class CycleRecordCodec:
             *record.actual,
             *record.torques,
             *record.words,
+            *record.tension_known,
             *pose_values,
         )
 
@@ -196,8 +197,9 @@ class CycleRecordCodec:
         cycle, at, state, index, rate, missing, rejected, error_frames = values[:8]
         error, lateness, press = values[8:11]
         m = self._cables
-        targets, actual, torques, words = (values[11 + k * m : 11 + (k + 1) * m] for k in range(4))
-        pose_values = values[11 + 4 * m :]
+        per_drive = [values[11 + k * m : 11 + (k + 1) * m] for k in range(5)]
+        targets, actual, torques, words, tension_known = per_drive
+        pose_values = values[11 + 5 * m :]
         record = CycleRecord(
             cycle=cycle,
             at=at,
@@ -213,6 +215,7 @@ class CycleRecordCodec:
             error_frames=error_frames,
             following_error=error,
             lateness=lateness,
+            tension_known=tension_known,
             press=press,
         )
         if math.isnan(pose_values[0]):

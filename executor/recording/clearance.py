@@ -249,7 +249,8 @@ def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> 
     regular = np.flatnonzero(known % every == 0)
     if not (model.obstacle_names and regular.size):
         return []
-    motion, noise = _motion(model.rig, cycles, known), tension_noise(model.rig, cycles.tensions)
+    motion = _motion(model.rig, cycles, known)
+    noise = tension_noise(model.rig, cycles.following_tensions)
     ends = np.array([0, known.size - 1])  # counted where the record begins or ends in motion
     in_motion = np.abs(motion[ends] - motion[regular[[0, -1]]]) > STEP
     more = np.union1d(regular, ends[in_motion])

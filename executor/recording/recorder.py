@@ -75,6 +75,7 @@ class RunLog:
                 *((name, "i4") for name in ("state", "missing", "rejected", "error_frames")),
                 *((name, "i8", per_drive) for name in ("targets", "actual")),
                 ("torques", "i4", per_drive),
+                ("tension_known", "?", per_drive),
             ]
         )
         self._chunks: list[Cycles] = []
@@ -166,13 +167,16 @@ class RunLog:
 
     def _reported_index(self, cycles: Cycles, first: int) -> Array:
         """Table index whose set-points the drives followed when they reported their positions."""
+        sent = np.asarray(cycles["index"], dtype=np.float64)
         if not self._delay:
-            return np.asarray(cycles["index"], dtype=np.float64)
+            return sent
         before = self._cycles(first - 1, first)["index"] if first else [0.0]
-        return np.concatenate([before, cycles["index"][:-1]])[: len(cycles)]
+        earlier = np.concatenate([before, sent[:-1]])[: len(cycles)]
+        # A stop sends no further row; a bus fault leaves no record of the cycle that sent the last.
+        return np.where(cycles["state"] == _STATES.index(State.LATCHED), sent, earlier)
 
     def _lengths(self, cycles: Cycles, rows: Integers) -> tuple[Array, Array, Array]:
-        """Cable lengths, tensions where torques give them, and how far lengths may be off a pose.
+        """Cable lengths, tensions where known, and how far lengths may be off a pose.
 
         Shapes (n, m), [m]; (n, m), [N]; and (n,), [m]. Tensions unlike the planned ones stretch the
         cables in ways that no pose has.
@@ -181,14 +185,14 @@ class RunLog:
             cycles: n cycles.
             rows: Table rows of the set-points sent, shape (n,).
         """
-        tensions = self._rig.tensions_by(cycles["torques"])
-        # Only the torques of drives that follow their set-points give cable tensions.
-        taut = np.isfinite(cycles["following_error"])[:, None]
+        tensions, known = self._rig.tensions_by(cycles["torques"]), cycles["tension_known"]
+        # A drive that follows, but did not answer, has its last torque and position.
+        taut = known | np.isfinite(cycles["following_error"])[:, None]
         planned, winches = self._checked.table.tensions[rows], self._checked.winches
         unstrained = winches.unstrained_from_counts(cycles["actual"].astype(np.float64))
         lengths = winches.strained(unstrained, np.where(taut, tensions, planned))
         more_stretch = np.linalg.norm(lengths - winches.strained(unstrained, planned), axis=1)
-        return lengths, np.where(taut, tensions, np.nan), self._fits_within + more_stretch
+        return lengths, np.where(known, tensions, np.nan), self._fits_within + more_stretch
 
     def _stop_at(self, row: int) -> str:
         """Name of the stop at which the platform dwells; empty between stops."""

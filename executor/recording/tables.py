@@ -20,7 +20,7 @@ from executor.recording.table_files import (
     numbers,
     texts,
 )
-from executor.state_machine import ON_PATH
+from executor.state_machine import ON_PATH, State
 from model.pose import Array, Pose, quaternion_from_matrix
 from tracking.fusion import Measured, fuse_with_encoders
 from tracking.pose_log import COVARIANCE, POSITION, ROTATION, SCALES, STD
@@ -70,7 +70,8 @@ class CycleTable(Table):
         actual_counts: Reported positions, shape (n, m), [counts].
         lengths: Cable lengths from the actual positions, shape (n, m), [m].
         planned_tensions: Tensions of the plan, shape (n, m), [N].
-        tensions: Tensions from the drives' torques, shape (n, m), [N].
+        tensions: Tensions from the torques of drives that answered and follow set-points or, after
+            a fault, hold under torque, shape (n, m), [N].
     """
 
     cycle: Annotated[Integers, integers("cycle")]
@@ -117,6 +118,25 @@ class CycleTable(Table):
     def has_encoder_pose(self) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
         """Whether the encoders give a pose, shape (n,)."""
         return np.asarray(np.isfinite(np.hstack([self.encoder, self.encoder_rotation])).all(axis=1))
+
+    @property
+    def following_tensions(self) -> Array:
+        """Tensions while all drives follow set-points, shape (n, m), [N]; NaN after a stop."""
+        return np.where(np.isfinite(self.following_error)[:, None], self.tensions, np.nan)
+
+    @property
+    def tensions_until(self) -> dict[int, float]:
+        """Times until which tensions are known [s], by the number of their cable, from 1.
+
+        Only of those unknown at the end after a fault, which is a record that ends along the path
+        or with the fault latched.
+        """
+        known, end = np.isfinite(self.tensions), self.state[-1]
+        if end not in (*_ON_PATH, State.LATCHED.value):
+            return {}
+        lost = known.any(axis=0) & (~known[-1] | (end != State.LATCHED.value))
+        last = len(known) - 1 - np.argmax(known[::-1], axis=0)
+        return {int(i) + 1: float(self.time[last[i]]) for i in np.flatnonzero(lost)}
 
     @property
     def encoder_error(self) -> Array:

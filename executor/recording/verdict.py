@@ -20,7 +20,7 @@ from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
 from model.files.reading import ready_folder
 from model.plan import Plan
-from model.pose import Array, Pose
+from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene
 from tracking.clearance import INTERVAL
@@ -256,17 +256,25 @@ def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:
     slack, overload = tension_limits(rig)
     limits = f"limits {rig.min_tension:g} and {rig.max_tension:g} N"
     limits += f"; a run fails below {slack:g} or above {overload:g} N"
-    if low < slack or high > overload:
-        value, what = (low, "went slack:") if low < slack else (high, "pulled")
-        at, cable = _where(cycles.tensions, value)
-        text = f"Cable {cable} {what} {value:.2f} N at {cycles.time[at]:.2f} s ({limits})."
-        return [Check("tension", False, text)]
-    return [Check("tension", True, f"Tensions stayed in {low:.1f} to {high:.1f} N ({limits}).")]
+    found = [_first_at(cycles, low, "went slack:")] if low < slack else []
+    found += [_first_at(cycles, high, "pulled")] if high > overload else []
+    text = "; cable ".join(found)
+    text = f"Cable {text}" if found else f"Tensions stayed in {low:.1f} to {high:.1f} N"
+    return [Check("tension", not found, f"{text} ({limits}){_known_until(cycles)}.")]
 
 
-def _where(values: Array, value: float) -> tuple[int, int]:
-    row, column = np.argwhere(values == value)[0]
-    return int(row), int(column) + 1
+def _first_at(cycles: CycleTable, value: float, what: str) -> str:
+    row, column = np.argwhere(cycles.tensions == value)[0]
+    return f"{column + 1} {what} {value:.2f} N at {cycles.time[row]:.2f} s"
+
+
+def _known_until(cycles: CycleTable) -> str:
+    """Until when tensions are known, where a fault left them unknown; else empty."""
+    until = cycles.tensions_until
+    latest = max(until.values()) if len(until) == cycles.cable_count else None
+    text = "" if latest is None else f"; tensions are known only until {latest:.2f} s"
+    alone = ((cable, time) for cable, time in until.items() if time != latest)
+    return text + "".join(f"; that of cable {n} only until {time:.2f} s" for n, time in alone)
 
 
 def distances(

@@ -599,6 +599,17 @@ def test_a_rest_lasts_while_tensions_are_measured() -> None:
     assert np.isnan(unknown.tensions).all()
 
 
+def test_a_lost_reply_does_not_lose_the_tensions_of_a_rest() -> None:
+    time = np.arange(0.0, 1.0, 0.01)
+    counts, tensions = np.zeros((len(time), 2)), np.full((len(time), 2), 20.0)
+    tensions[60, 1] = np.nan
+    none = np.empty(0)
+    seen = (none, none.reshape(0, 3), none.reshape(0, 3, 3), none.reshape(0, 6, 6))
+    found = at_rest("run", Recording(time, counts, counts, tensions, *seen))
+    assert found.names == ("run, rest 1",)
+    assert found.tensions.tolist() == [[20.0, 20.0]]
+
+
 def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Truth) -> None:
     """Winches 1 and 2 swapped, or a stated drum deviation far below the true error."""
     counts = tilted.measured.counts.copy()

@@ -191,6 +191,7 @@ def _record(cycle: int) -> CycleRecord:
         error_frames=7 * cycle,
         following_error=0.001,
         lateness=0.05,
+        tension_known=(True,) * 8,
     )
 
 

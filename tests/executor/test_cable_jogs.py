@@ -338,7 +338,7 @@ def cycle(targets: list[int], tension: list[float], index: float, rate: float) -
     return CycleRecord(
         cycle=1, at=1.0, state=State.MOVING, index=index, rate=rate, targets=tuple(targets),
         actual=zero, torques=torques, words=zero, missing=0, rejected=0, error_frames=0,
-        following_error=0.0, lateness=0.0,
+        following_error=0.0, lateness=0.0, tension_known=(True,) * 8,
     )  # fmt: skip
 
 

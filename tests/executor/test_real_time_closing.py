@@ -179,7 +179,7 @@ def dies_after(words: list[int], missing: int, job: Any, link: Connection, _pid:
         shown = (QUICK, word, *[BRAKED] * 6)
         record = CycleRecord(
             cycle, 0.004 * cycle, State.ENABLING, 0.0, 0.0, rest, rest, rest, shown, missing, 0, 0,
-            0.0, 0.0,
+            0.0, 0.0, (False,) * 8,
         )  # fmt: skip
         ring.put(codec.pack(record, None))
     link.send(Armed("", (0,) * 8, released=nodes[1:], nodes=nodes))

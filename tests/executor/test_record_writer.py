@@ -208,7 +208,9 @@ def cycle_at(at: float, state: State) -> CycleRecord:
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     counts = tuple(winch.home_counts for winch in rig.winches)
     zeros = (0,) * rig.cable_count
-    return CycleRecord(0, at, state, 0.0, 1.0, counts, counts, zeros, zeros, 0, 0, 0, 0.0, 0.0)
+    return CycleRecord(
+        0, at, state, 0.0, 1.0, counts, counts, zeros, zeros, 0, 0, 0, 0.0, 0.0, (True,) * 8,
+    )  # fmt: skip
 
 
 def test_a_full_disk_hides_nothing_else_of_a_cycle(

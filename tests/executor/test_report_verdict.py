@@ -301,6 +301,47 @@ def test_drives_whose_positions_fit_no_pose_on_the_path_fail_the_run(run: fake_r
     assert not encoder_pose(replace(run.cycles, encoder=encoder, missing=missing))
 
 
+def test_a_slack_cable_does_not_hide_an_overloaded_one(run: fake_run.FakeRun) -> None:
+    changed = run.cycles.tensions.copy()
+    changed[9, 4], changed[11, 1] = 1.0, 111.0
+    (check,) = tensions(replace(run.cycles, tensions=changed), run.context.rig)
+    assert not check.passed
+    assert "Cable 5 went slack: 1.00 N at 1.80 s; cable 2 pulled 111.00 N at 2.20 s" in check.text
+
+
+@pytest.mark.parametrize(
+    ("state", "lost", "until"),
+    [
+        ("latched", {}, ""),
+        ("latched", {2: 8}, "; that of cable 3 only until 1.40 s"),
+        (
+            "latched",
+            {2: 8, 4: 9},
+            "; that of cable 3 only until 1.40 s; that of cable 5 only until 1.60 s",
+        ),
+        ("latched", dict.fromkeys(range(8), 8), "; tensions are known only until 1.40 s"),
+        (
+            "latched",
+            {**dict.fromkeys(range(8), 9), 2: 8},
+            "; tensions are known only until 1.60 s; that of cable 3 only until 1.40 s",
+        ),
+        ("moving", dict.fromkeys(range(8), 8), "; tensions are known only until 1.40 s"),
+        ("securing", dict.fromkeys(range(8), 8), ""),
+    ],
+)
+def test_tensions_unknown_after_a_fault_are_stated(
+    run: fake_run.FakeRun, state: str, lost: dict[int, int], until: str
+) -> None:
+    """Other runs end with drives that hold on their own; their tensions are those before."""
+    cycles, known = run.cycles, run.cycles.tensions.copy()
+    for cable, cycle in lost.items():
+        known[cycle:, cable] = np.nan
+    ended = replace(cycles, tensions=known, state=(*cycles.state[:-1], state))
+    (check,) = tensions(ended, run.context.rig)
+    assert check.passed
+    assert check.text.partition("102 N)")[2] == f"{until}."
+
+
 def test_drives_without_torque_are_not_judged_by_it(run: fake_run.FakeRun) -> None:
     unknown = replace(run.cycles, tensions=np.full_like(run.cycles.tensions, np.nan))
     assert tensions(unknown, run.context.rig) == []

@@ -127,6 +127,7 @@ def test_a_record_comes_back_as_it_was(state, counts, numbers, error, rotated):
         error_frames=7,
         following_error=error,
         lateness=numbers[3],
+        tension_known=(rotated, True),
         press=2**50,
     )
     wire = CycleRecordCodec(2)

@@ -23,7 +23,7 @@ def record(cycle: int) -> CycleRecord:
     state, nothing = State.MOVING, float("nan")
     return CycleRecord(
         cycle, 100.0 + cycle / 100.0, state, 0.0, 1.0, (10, 20), (11, -21), (30, 40), (0, 0), 0,
-        0, 0, nothing, 0.0,
+        0, 0, nothing, 0.0, (False, False),
     )  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from drivers.can_bus import BusSettings, open_bus
 from drivers.factory import make_drive_group
 from drivers.odrive.messages import AxisError, AxisState
 from executor.recording.run_folder import RunFolder
+from executor.recording.verdict import tensions
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Refused
@@ -235,6 +236,11 @@ def test_a_fault_of_one_drive_is_a_hold_of_all_and_then_their_brakes(
     assert noticed - CRUISING <= case.within
     targets = np.array(seen.targets)
     assert (targets[noticed + 2 :] == targets[noticed + 2]).all(), "nothing moves on"
+    cycles = outcome.log.table()
+    stopped = np.array(cycles.state) == State.LATCHED.value
+    assert np.isnan(cycles.tensions[stopped]).all(), "states lag behind torques"
+    (check,) = tensions(cycles, prepared.rig)
+    assert "known only until" in check.text
     others = np.delete(np.array(seen.enabled), 2, axis=1)
     assert (others.all(axis=1) | ~others.any(axis=1)).all(), "the others never one alone"
     held = int(others[noticed:].all(axis=1).sum())

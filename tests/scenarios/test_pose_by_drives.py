@@ -125,7 +125,7 @@ def test_planned_orientation_is_that_of_the_fraction_of_a_row(prepared: Prepared
         log.add(
             CycleRecord(
                 cycle, 0.01 * cycle, State.MOVING, index, 1.0, counts, counts,
-                zeros, zeros, 0, 0, 0, 0.0, 0.0,
+                zeros, zeros, 0, 0, 0, 0.0, 0.0, (True,) * len(zeros),
             )
         )  # fmt: skip
     cycles, rows = log.table(), turning.poses()
