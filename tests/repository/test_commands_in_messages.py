@@ -86,6 +86,7 @@ ONLY_TYPED = {
     "drivers/plausibility.py": "part of the command `cdpr home`",
     "executor/cameras/sources.py": "--camera and --no-camera together",
     "executor/doctor.py": "options of pip, and --drives",
+    "executor/realtime/scheduling.py": "an option of docker",
     "model/files/documents.py": "--help",
     "model/files/output.py": "--force",
     "model/pages/viewer.py": "properties of a style sheet",
