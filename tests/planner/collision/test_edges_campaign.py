@@ -9,7 +9,7 @@ import pytest
 
 from model.pose import Array, Pose
 from model.rig import load_rig
-from planner.collision.edges import edge_free, edges_free
+from planner.collision.edges import edge_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World
 from tests.effort import cases
@@ -48,7 +48,8 @@ def test_no_accepted_edge_violates_its_clearance_anywhere() -> None:
         starts = rng.uniform(low, high, (EDGES, 3))
         reach = rng.choice([0.02, 0.1, 0.5], (EDGES, 1))
         ends = np.clip(starts + reach * rng.normal(size=(EDGES, 3)), low, high)
-        free = edges_free(world, starts, ends)
+        pairs = zip(starts, ends, strict=True)
+        free = np.array([edge_free(world, *edge) for edge in pairs])
         edges = list(zip(starts[free], ends[free], strict=True))
         blocked = ends[~free]
         looked_at = [(edge, rng.uniform(size=POSES)) for edge in edges]
