@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from model.rig import load_rig
 from model.scene import load_scene
 from planner.edge_checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
+from tests.configs import GACHON
 
 ROOT = Path(__file__).parents[2]
-GACHON = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
 SCENE = load_scene(ROOT / "configs" / "environment_1.yaml")
 HOME = GACHON.home.position
 

@@ -24,15 +24,8 @@ from planner.costs import KinematicCost
 from planner.path import Route
 from planner.planning import make_plan
 from planner.settings import TurningSettings
-from tests.planner.anytime_6d.rotating_scenes import (
-    CONFIGS,
-    GACHON,
-    HALL,
-    Judge,
-    quaternion,
-    turning,
-    upside_down,
-)
+from tests.configs import CONFIGS, GACHON, HALL
+from tests.planner.anytime_6d.rotating_scenes import Judge, quaternion, turning, upside_down
 
 ROUNDS = TurningSettings(rounds=60)
 RAMP = load_scene(CONFIGS / "turn.yaml")

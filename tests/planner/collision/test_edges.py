@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,15 +9,13 @@ from scipy.spatial.transform import Rotation
 from model.errors import BadInput
 from model.kinematics import cables_at
 from model.pose import Array, Pose
-from model.rig import Rig, load_rig
+from model.rig import Rig
 from model.scene import load_scene
 from planner.collision.edges import edge_clearance, edge_free
 from planner.collision.world import build_world
+from tests.configs import CONFIGS, GACHON, HALL
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, changed_rig, random_scene
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 COAL = 1e-6
 """How far coal's own distances are trusted, [m]."""
 

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from model.pose import Array, Pose
-from model.rig import load_rig
 from planner.collision.edges import edge_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World
+from tests.configs import GACHON
 from tests.effort import cases
 from tests.planner.collision.sampled_oracle import CoalScene, random_scene
 
-GACHON = load_rig(Path(__file__).parents[3] / "configs" / "gachon_8_6.yaml")
 CLEARANCE = 0.01
 SCENES, EDGES, GRAZING = cases(125), 140, 20
 POSES, POSES_GRAZING = 2, 5

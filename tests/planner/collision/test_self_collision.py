@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -15,7 +13,7 @@ from model.distances import segment_pair_points
 from model.errors import BadInput
 from model.kinematics import cables_to
 from model.pose import Array
-from model.rig import Rig, load_rig
+from model.rig import Rig
 from planner.collision.world import (
     build_robot,
     build_world,
@@ -23,11 +21,9 @@ from planner.collision.world import (
     self_rotating_edge_free,
 )
 from planner.kernels.primitives import segment_pair_squared
+from tests.configs import GACHON, HALL
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 EMPTY = random_scene(np.random.default_rng(0), GACHON, 0)
 
 

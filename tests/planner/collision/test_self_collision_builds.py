@@ -21,7 +21,8 @@ from planner.collision.world import (
     self_rotating_edge_free,
     unproved_robot,
 )
-from tests.planner.collision.random_builds import GACHON, Build, random_build, rig_of
+from tests.configs import GACHON
+from tests.planner.collision.random_builds import Build, random_build, rig_of
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 
 EMPTY = random_scene(np.random.default_rng(0), GACHON, 0)

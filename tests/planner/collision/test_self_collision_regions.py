@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from itertools import product
-from pathlib import Path
 
 import numpy as np
 
 from model.pose import Array
-from model.rig import load_rig
 from model.scene import load_scene
 from planner.collision.self_collision_regions import CELLS, open_along
 from planner.collision.world import build_robot, build_world, self_edge_free
+from tests.configs import CONFIGS, GACHON
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
 LIMITS = np.array([[-0.2, -0.3, 0.1], [0.3, 0.3, 0.6]])
 
 

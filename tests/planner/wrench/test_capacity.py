@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from hypothesis import strategies as st
 
 from model.kinematics import structure_matrix
 from model.pose import Array, Pose
-from model.rig import Rig, load_rig
+from model.rig import Rig
 from model.scene import Scene, load_scene
 from planner.collision.world import build_world
 from planner.costs import capacity_margins
@@ -20,11 +19,9 @@ from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import build_load, factored, margins, orthogonal_vector
 from planner.wrench.feasibility_proof import tensions_prove
 from planner.wrench.translation import build_holding, edge_held
+from tests.configs import CONFIGS, GACHON, HALL
 from tests.planner.collision.sampled_oracle import changed_rig
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 PAPER = load_scene(CONFIGS / "environment_1.yaml")
 PILLAR = load_scene(CONFIGS / "hall_pillar.yaml")
 BOTH = pytest.mark.parametrize(("rig", "scene"), [(GACHON, PAPER), (HALL, PILLAR)])
