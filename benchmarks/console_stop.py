@@ -35,9 +35,10 @@ from alone import alone  # noqa: E402
 from playwright.sync_api import Page, expect  # noqa: E402
 from websockets.sync.client import ClientConnection  # noqa: E402
 
-from drivers.cia402.pdo import RPDO1_BASE, SYNC_ID, parse_set_point  # noqa: E402
+from drivers.cia402.pdo import RPDO1_BASE, SYNC_ID  # noqa: E402
 from tests.cli.plans import RIG  # noqa: E402
 from tests.console.browsing import browser_at, chromium  # noqa: E402
+from tests.drivers.drive_bench import parse_set_point  # noqa: E402
 from tests.scenarios.test_console import Operator, console, drives, operator, page_at  # noqa: E402
 
 #: Length of the listener's buffer, [frames]: some seconds.

@@ -43,7 +43,10 @@ def ours(family: str, exhaustive: bool) -> Finder:
     detector, modules = TagDetector(family), modules_across(family)
 
     def find(image: Image) -> Sequence[Array]:
-        rough = np.array([d.corners for d in detector.detect_all(image, exhaustive=exhaustive)])
+        found = detector.detect_all(image)
+        if exhaustive:
+            found = detector.detect_exhaustively(image, found)
+        rough = np.array([d.corners for d in found])
         squares = refine(image, _some_camera(image), rough.reshape(-1, 4, 2), modules)
         return [
             s.corners if s is not None and s.whole else corners

@@ -113,7 +113,7 @@ def judged(
             return Result(number, NOT_FOUND)
         problems = _refuted(rig, scene, kinematic, settings)
         return Result(number, SEPARATED, problems, again=again if problems else {})
-    path = found.route.path
+    path = found.path
     opinion = second_opinion(rig, scene, path)
     checked = number % _CHECKED_EVERY == 0
     problems = list(opinion.problems)
@@ -121,7 +121,7 @@ def judged(
         report = check_path(rig, scene, [Pose(p, scene.start.rotation) for p in path])
         problems += [f"cdpr check: {violation.sentence()}" for violation in report.violations]
     if problems:
-        again |= {"rounds": found.rounds, "path_mm": (1e3 * path).tolist()}
+        again |= {"rounds": found.iterations, "path_mm": (1e3 * path).tolist()}
     slack_mm = opinion.slack * 1e3 if np.isfinite(opinion.slack) else None
     kept = again if problems else {}
     return Result(number, PLANNED, problems, slack_mm, opinion.distances, checked, kept)

@@ -280,11 +280,11 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
         write_mcap(folder, result.context, cycles, poses, clearance, together, result.alone)
 
     files: list[_File] = [
-        (CYCLES, partial(folder.write_cycles, cycles)),
+        (CYCLES, partial(folder.write_table, CYCLES, cycles)),
         *_pose_files(folder, poses, result.alone),
-        (CLEARANCE, partial(folder.write_clearance, clearance)),
+        (CLEARANCE, partial(folder.write_table, CLEARANCE, clearance)),
         (SUMMARY, partial(folder.write_summary, result.summary)),
-        (FUSED, lambda: folder.write_fused(fused_table(cycles, poses))),
+        (FUSED, lambda: folder.write_table(FUSED, fused_table(cycles, poses))),
         (MCAP, write_channels),
     ]
     sums = partial(write_checksums, folder.path, [*BEGUN, *dict(files)])
@@ -292,11 +292,8 @@ def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
 
 
 def _pose_files(folder: RunFolder, poses: PoseTable, alone: Mapping[str, PoseTable]) -> list[_File]:
-    each = [
-        (POSES_OF.format(name), partial(folder.write_poses_of, name, table))
-        for name, table in alone.items()
-    ]
-    return [(POSES, partial(folder.write_poses, poses)), *each]
+    tables = {POSES: poses, **{POSES_OF.format(name): table for name, table in alone.items()}}
+    return [(name, partial(folder.write_table, name, table)) for name, table in tables.items()]
 
 
 def _written(

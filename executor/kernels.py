@@ -6,57 +6,41 @@ Only these functions load Numba: a real-time process on a real bus does not need
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import simulation
 import tracking
 from model.progress import SILENT, Listener
 
-if TYPE_CHECKING:
-    from model.jit import KernelSet
+
+def ready_to_measure(listener: Listener = SILENT, *, only_missing: bool = False) -> None:
+    """Loads the tag edge detector, so that no image waits for it.
+
+    Args:
+        listener: Receives the wait.
+        only_missing: Only compiles it, if necessary: other processes then load it.
+    """
+    from model.jit import KernelSet, compilation
+
+    task = KernelSet("edges", (Path(tracking.__path__[0]) / "edges",))
+    with compilation(task, "the tag edge detector", "up to a minute", listener) as is_compiled:
+        if not (only_missing and is_compiled):
+            from tracking.edges import refine
+
+            refine.load_kernels()
 
 
-def ready_to_measure(listener: Listener = SILENT) -> None:
-    """Loads the tag edge detector, so that no image waits for it."""
-    from model.jit import compilation
-    from tracking.edges import refine
+def ready_to_simulate(listener: Listener = SILENT, *, only_missing: bool = False) -> None:
+    """Loads the equilibrium solver of the simulated platform, so that no drive waits.
 
-    with compilation(_edges(), "the tag edge detector", "up to a minute", listener):
-        refine.load_kernels()
+    Args:
+        listener: Receives the wait.
+        only_missing: As for `ready_to_measure`.
+    """
+    from model.jit import KernelSet, compilation
 
+    task = KernelSet("platform", (Path(simulation.__path__[0]) / "equilibrium",))
+    with compilation(task, "the simulated platform", "about ten seconds", listener) as is_compiled:
+        if not (only_missing and is_compiled):
+            from simulation import plant
 
-def ready_to_simulate(listener: Listener = SILENT) -> None:
-    """Loads the equilibrium solver of the simulated platform, so that no drive waits."""
-    from model.jit import compilation
-    from simulation import plant
-
-    with compilation(_platform(), "the simulated platform", "about ten seconds", listener):
-        plant.load_kernels()
-
-
-def ready_for_camera_processes(listener: Listener = SILENT) -> None:
-    """Compiles the tag edge detector once, for processes that then only load it."""
-    from model import jit
-
-    if not jit.is_compiled(_edges()):
-        ready_to_measure(listener)
-
-
-def ready_for_simulating_process(listener: Listener = SILENT) -> None:
-    """Compiles the simulated platform once, for a process that then only loads it."""
-    from model import jit
-
-    if not jit.is_compiled(_platform()):
-        ready_to_simulate(listener)
-
-
-def _edges() -> KernelSet:
-    from model.jit import KernelSet
-
-    return KernelSet("edges", (Path(tracking.__path__[0]) / "edges",))
-
-
-def _platform() -> KernelSet:
-    from model.jit import KernelSet
-
-    return KernelSet("platform", (Path(simulation.__path__[0]) / "equilibrium",))
+            plant.load_kernels()

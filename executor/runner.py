@@ -33,7 +33,7 @@ from executor.drives import (
 )
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
-from executor.kernels import ready_for_simulating_process
+from executor.kernels import ready_to_simulate
 from executor.proposals import Proposal, motion_proposal, require_confirmed
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
@@ -383,7 +383,7 @@ def _move_in_real_time(
 
     simulated = is_simulated(prepared.rig)
     if simulated:
-        ready_for_simulating_process(options.listener)
+        ready_to_simulate(options.listener, only_missing=True)
     start, load = options.start or prepared.scene.start, prepared.scene.load
     return run_in_real_time(
         prepared,

@@ -20,7 +20,7 @@ from executor.control.winch_motion import (
 from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_drives_of
 from executor.hold_to_run.presses import PressBoard
 from executor.interlock.interlock import MotionInterlock
-from executor.kernels import ready_for_simulating_process
+from executor.kernels import ready_to_simulate
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.process import real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
@@ -208,7 +208,7 @@ def move_supervised(
             moving = WinchesHere(task, drives, clock, board)
         else:
             if simulated:
-                ready_for_simulating_process(listener)
+                ready_to_simulate(listener, only_missing=True)
             process = real_time_process(
                 task,
                 make_drives,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from model.pose import Array
 from model.rig import Rig
@@ -60,17 +60,6 @@ def edge_problem(
     if not edge_held(world, load, holding, start, end):
         return WRENCH
     return FREE
-
-
-@kernel
-def edge_problems(
-    world: World, robot: Robot, load: LoadArrays, holding: Holding, starts: Array, ends: Array
-) -> NDArray[np.int8]:
-    """`edge_problem` for many edges, shape (k, 3) each, [m]; shape (k,)."""
-    found = np.empty(len(starts), dtype=np.int8)
-    for i in range(len(starts)):
-        found[i] = edge_problem(world, robot, load, holding, starts[i], ends[i])
-    return found
 
 
 @kernel
@@ -150,11 +139,6 @@ class ExactChecks:
         """What forbids a translation between positions, shape (3,), [m]; see `edge_problem`."""
         args = (self.world, self.robot, self.load, self.holding)
         return int(edge_problem(*args, _own(start), _own(end)))
-
-    def problems(self, starts: ArrayLike, ends: ArrayLike) -> NDArray[np.int8]:
-        """`problem` for many edges, shape (k, 3) each, [m]; shape (k,)."""
-        args = (self.world, self.robot, self.load, self.holding)
-        return edge_problems(*args, _own(starts), _own(ends))
 
     def clearance(self, start: ArrayLike, end: ArrayLike) -> tuple[float, int, int]:
         """Smallest distance to an obstacle along a translation, [m], its body and obstacle."""

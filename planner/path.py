@@ -26,8 +26,9 @@ class Route:
         raw: The path before post-processing, shape (j, n).
         nodes: Of the search tree, shape (i, n); they include the ends of both paths.
         parents: Of each node, -1 for the root, shape (i,).
-        iterations: Number of samples drawn.
+        iterations: Number of samples drawn, or of rounds, which reproduce the route.
         edge_checks: Number of edges checked, post-processing included.
+        search_time: Of the rounds, [s]; None for the paper's planners.
     """
 
     path: Array
@@ -36,6 +37,23 @@ class Route:
     parents: NDArray[np.int64]
     iterations: int
     edge_checks: int
+    search_time: float | None = None
+
+    @classmethod
+    def from_rounds(
+        cls, path: Array, first: Array, rounds: int, checks: int, search_time: float
+    ) -> Route:
+        """The result of a search in rounds; its tree is the first path that it found.
+
+        Args:
+            path: Shape (k, n).
+            first: Shape (j, n).
+            rounds: Number of rounds done.
+            checks: Number of edges checked.
+            search_time: [s].
+        """
+        parents = np.arange(-1, len(first) - 1, dtype=np.int64)
+        return cls(path, first, first, parents, rounds, checks, search_time)
 
 
 def smallest_gap(first: Array, second: Array) -> float:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -49,11 +49,6 @@ from planner.settings import (
 )
 from planner.space import PoseSpace, Space, TranslationSpace
 
-if TYPE_CHECKING:
-    from planner.anytime.path import OptimalRoute
-    from planner.anytime_6d.path import RotatingRoute
-
-
 # The whole path through a scene: its legs planned one after the other, and joined.
 
 
@@ -68,14 +63,12 @@ class MultiSegmentPath:
     Attributes:
         route: From start to goal; its tree has a root for each leg.
         stops: Indices of the path's points at stops.
-        rounds: Of each leg, to reproduce it; empty for the paper's planners.
-        search_time: Of the legs together, [s]; None for the paper's planners.
+        iterations: Of each leg; see `Route`.
     """
 
     route: Route
     stops: tuple[int, ...]
-    rounds: tuple[int, ...]
-    search_time: float | None
+    iterations: tuple[int, ...]
 
 
 def plan_segments(
@@ -100,20 +93,17 @@ def plan_segments(
         NoSolution: A leg has no path, or its search ended at its limit; the error names the leg.
     """
     routes: list[Route] = []
-    found: list[OptimalRoute | RotatingRoute] = []
     for leg, own in zip(legs, settings, strict=True):
         try:
             # Planners are imported only when used: their kernels take long to load.
             if isinstance(own, OptimalSettings):
                 from planner.anytime.path import optimal_route
 
-                found.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
-                routes.append(found[-1].route)
+                routes.append(optimal_route(rig, leg.scene, own, kinematic, progress, clock))
             elif isinstance(own, TurningSettings):
                 from planner.anytime_6d.path import rotating_route
 
-                found.append(rotating_route(rig, leg.scene, own, kinematic, progress, clock))
-                routes.append(found[-1].route)
+                routes.append(rotating_route(rig, leg.scene, own, kinematic, progress, clock))
             else:
                 from planner.rrt.path import paper_route
 
@@ -122,11 +112,7 @@ def plan_segments(
             if len(legs) > 1:
                 error.what = f"from {leg.begin} to {leg.end}: {error.what}"
             raise
-    return MultiSegmentPath(
-        *_joined(routes),
-        rounds=tuple(f.rounds for f in found),
-        search_time=sum(max(0.0, f.search_time) for f in found) if found else None,
-    )
+    return MultiSegmentPath(*_joined(routes), tuple(route.iterations for route in routes))
 
 
 def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> Sequence[Settings]:
@@ -160,6 +146,7 @@ def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
     """The routes end to end, and the indices of the points where two of them meet."""
     lengths = [len(route.path) - 1 for route in routes]
     before = [0, *accumulate(len(route.nodes) for route in routes[:-1])]
+    times = [route.search_time for route in routes if route.search_time is not None]
     joined = Route(
         path=_end_to_end([route.path for route in routes]),
         raw=_end_to_end([route.raw for route in routes]),
@@ -172,6 +159,7 @@ def _joined(routes: Sequence[Route]) -> tuple[Route, tuple[int, ...]]:
         ),
         iterations=sum(route.iterations for route in routes),
         edge_checks=sum(route.edge_checks for route in routes),
+        search_time=sum(max(0.0, spent) for spent in times) if times else None,
     )
     return joined, tuple(accumulate(lengths[:-1]))
 
@@ -258,7 +246,7 @@ def make_plan(
                 "iterations": route.iterations,
                 "edge_checks": route.edge_checks,
                 "planning_time_s": max(0.0, clock() - began),
-                "search_time_s": path.search_time,
+                "search_time_s": route.search_time,
             },
             "quality": _quality(report, route.raw, kinematic.mean_along_poses(poses)),
         }
@@ -407,7 +395,7 @@ def _anytime_planner(settings: AnytimeSettings, path: MultiSegmentPath) -> dict[
         "name": "turning" if isinstance(settings, TurningSettings) else "optimal",
         "weights": asdict(settings.weights),
         "seed": settings.seed,
-        "rounds": list(path.rounds),
+        "rounds": list(path.iterations),
         "budget_ms": settings.budget * 1000.0 if settings.rounds is None else None,
         "longest_mm": longest * 1000.0 if longest < float("inf") else None,
     }

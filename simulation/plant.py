@@ -235,16 +235,6 @@ class Plant:
         """
         self._is_supported = True
 
-    def counts_for(self, pose: Pose, tensions: Array) -> Array:
-        """Drive positions for a pose with given tensions, not rounded, shape (m,).
-
-        Args:
-            pose: ``world_from_platform``.
-            tensions: Shape (m,), [N]; must be in equilibrium, or the platform settles elsewhere.
-        """
-        lengths = cables_at(self._rig, pose).lengths
-        return self.winch_map.counts(self.winch_map.unstrained(lengths, tensions))
-
     def settle_counts(self, counts: Array) -> None:
         """`settle` at drive positions, shape (m,), [counts]."""
         for _ in self.settling_counts(counts):

@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import ours
 from figures import growth_figure
+from numpy.typing import NDArray
 from rich.progress import track
 
 from model.files.scene_file import SceneDocument
@@ -32,9 +33,10 @@ from model.rig import Rig, load_rig
 from model.scene import Scene, load_scene, scene_from_document
 from model.statics.feasibility import capacity_margin
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.collision.edges import edges_free
+from planner.collision.edges import edge_free
 from planner.collision.world import build_world
 from planner.costs import external_wrenches
+from planner.kernels.jit import kernel
 from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import build_load, margins
 
@@ -145,7 +147,7 @@ def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats
     directions = random.normal(size=(EDGES, 3))
     ends = starts + EDGE * directions / np.linalg.norm(directions, axis=1)[:, None]
     ends = np.clip(ends, rig.workspace_lower, rig.workspace_upper)
-    free = edges_free(world, starts, ends)
+    free = _edges_free(world, starts, ends)
     some = np.flatnonzero(free)
     chosen = np.resize(some, EDGES) if len(some) else np.zeros(0, dtype=np.int64)
     free_edge = _time(world, starts[chosen], ends[chosen], repeats)
@@ -158,6 +160,15 @@ def cost(rig: Rig, scene: Scene, random: np.random.Generator, size: int, repeats
                 contestant.open_comparisons)  # fmt: skip
 
 
+@kernel
+def _edges_free(world: World, starts: Array, ends: Array) -> NDArray[np.bool_]:
+    """Whether edges, shape (k, 3) each, [m], are free; compiled, so that no call is timed."""
+    free = np.empty(len(starts), dtype=np.bool_)
+    for i in range(len(starts)):
+        free[i] = edge_free(world, starts[i], ends[i])
+    return free
+
+
 def _nearest(points: Array, wanted: Array) -> Array:
     nearest: Array = points[np.argmin(np.linalg.norm(points - wanted, axis=1))]
     return nearest
@@ -167,7 +178,7 @@ def _time(world: World, starts: Array, ends: Array, repeats: int) -> float:
     """Processor time of one edge, [µs]."""
     if not len(starts):
         return float("nan")
-    return _best(lambda: edges_free(world, starts, ends), repeats) / len(starts) * 1e6
+    return _best(lambda: _edges_free(world, starts, ends), repeats) / len(starts) * 1e6
 
 
 def crowded(base: Scene, count: int, random: np.random.Generator) -> Scene:

@@ -411,7 +411,7 @@ def _fits(print_: Print, width: float, height: float) -> bool:
 
 def _page(width: float, height: float, placed: Sequence[tuple[Print, Array]], caption: str) -> Page:
     """A page with prints, the ruler, and a caption at the foot or one below each print."""
-    black, texts = _ruler(width, height)
+    black, texts = _ruler(height)
     discs = np.zeros((0, 3))
     for print_, corner in placed:
         black = np.concatenate([black, 1e3 * print_.black + [*corner, 0.0, 0.0]])
@@ -424,7 +424,7 @@ def _page(width: float, height: float, placed: Sequence[tuple[Print, Array]], ca
     return Page(width, height, black, tuple(texts), discs)
 
 
-def _ruler(width: float, height: float) -> tuple[Array, list[Text]]:
+def _ruler(height: float) -> tuple[Array, list[Text]]:
     """The ruler at the foot of the page."""
     left, top = MARGIN_MM, height - MARGIN_MM - _FOOT_MM + 2.0
     ticks = [[left, top, RULER_MM, 0.2]]

@@ -9,17 +9,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Generic, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from executor.remote.protocol import (
-    Cable,
-    Frame,
-    Number,
-    Sense,
-    Share,
-    require_one_motion,
-    require_step,
-)
+from executor.remote.protocol import HeldMotion, Number
 from executor.supervision import FASTEST, SLOWEST
 
 #: Longest message, [bytes].
@@ -162,28 +154,18 @@ class ForgetCommand(_Command):
     pose: Text
 
 
-class Held(_Incoming):
-    """A jog control is held: for the platform with a direction, for a cable with a sense.
+class Held(_Incoming, HeldMotion):
+    """A jog control is held.
 
     `state` is the number of the newest state that the page has received.
     """
 
     kind: Literal["held"]
     hold: Number
-    direction: Annotated[list[Share], Field(min_length=3, max_length=3)] | None = None
-    frame: Frame | None = None
-    cable: Cable | None = None
-    sense: Sense | None = None
     step_mm: float | None
     speed_mm_s: Annotated[float, Field(gt=0.0, le=1000.0, allow_inf_nan=False)]
     seq: Number
     state: Number
-
-    @model_validator(mode="after")
-    def _possible(self) -> Held:
-        require_one_motion(self.direction, self.frame, self.cable, self.sense)
-        require_step(self.step_mm)
-        return self
 
 
 class LetGo(_Incoming):

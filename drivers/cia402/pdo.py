@@ -77,11 +77,6 @@ def make_set_point(control_word: int, target: int) -> bytes:
     return _RPDO1.pack(control_word, target)
 
 
-def parse_set_point(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Control word and target of an RPDO1; None if the length is wrong."""
-    return _RPDO1.unpack(data) if len(data) == _RPDO1.size else None
-
-
 def parse_reply(data: bytes | bytearray) -> Reply | None:
     """TPDO1: 6041h, 6064h and 6077h as a `Reply`; None if the length is wrong."""
     return Reply(*_TPDO1.unpack(data)) if len(data) == _TPDO1.size else None

@@ -23,7 +23,7 @@ from executor.cameras.process import (
     ImageSource,
 )
 from executor.cameras.sources import SYNTHETIC, cycles_per_image
-from executor.kernels import ready_for_camera_processes, ready_to_measure
+from executor.kernels import ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
 from executor.recording.run_folder import RunFolder
 from executor.supervision import RequestBoard
@@ -76,7 +76,7 @@ def open_cameras(
     report_unmeasured_rotation(rig, table.rotations, listener)
     pictures = len(table) // cycles_per_image(asked_rate(sources), table.cycle)
     keep_every = max(1, pictures // KEPT_IMAGES)
-    ready_for_camera_processes(listener)
+    ready_to_measure(listener, only_missing=True)
     with ExitStack() as stack:
         processes, lives = {}, {}
         for camera, source in sources.items():

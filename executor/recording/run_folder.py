@@ -27,8 +27,8 @@ from executor.recording.record_files import (
     read_record,
     whole_lines,
 )
-from executor.recording.table_files import TableFile
-from executor.recording.tables import CycleTable, FusedTable, PoseTable
+from executor.recording.table_files import Table, TableFile
+from executor.recording.tables import CycleTable, PoseTable
 from model.errors import BadInput, Fault
 from model.files.documents import write_atomic
 from model.files.plan_file import PlanDocument
@@ -238,9 +238,9 @@ class RunFolder:
         """
         return rig_from_document(read_record(self.path / RIG, RigDocument)[0])
 
-    def write_cycles(self, table: CycleTable) -> None:
-        """Writes ``cycles.csv``."""
-        table.write_csv(self.path / CYCLES)
+    def write_table(self, name: str, table: Table) -> None:
+        """Writes one of the CSV files."""
+        table.write_csv(self.path / name)
 
     def cycles(self) -> CycleTable:
         """Reads ``cycles.csv``.
@@ -295,17 +295,9 @@ class RunFolder:
         """
         return RunCourse.load(self.path / COURSE)
 
-    def write_poses(self, table: PoseTable) -> None:
-        """Writes ``poses.csv``."""
-        table.write_csv(self.path / POSES)
-
     def poses(self) -> PoseTable:
         """Reads ``poses.csv``."""
         return PoseTable.read_csv(self.path / POSES)
-
-    def write_poses_of(self, camera: str, table: PoseTable) -> None:
-        """Writes ``poses-<camera>.csv``: the poses of one of several cameras."""
-        table.write_csv(self.path / POSES_OF.format(camera))
 
     def poses_by_camera(self) -> dict[str, PoseTable]:
         """Reads the poses of each of several cameras; empty for a single camera."""
@@ -313,17 +305,9 @@ class RunFolder:
         files = {name: self.path / POSES_OF.format(name) for name in names if len(names) > 1}
         return {name: PoseTable.read_csv(file) for name, file in files.items() if file.is_file()}
 
-    def write_clearance(self, table: ClearanceTable) -> None:
-        """Writes ``clearance.csv``."""
-        table.write_csv(self.path / CLEARANCE)
-
     def clearance(self) -> ClearanceTable:
         """Reads ``clearance.csv``."""
         return ClearanceTable.read_csv(self.path / CLEARANCE)
-
-    def write_fused(self, table: FusedTable) -> None:
-        """Writes ``fused.csv``."""
-        table.write_csv(self.path / FUSED)
 
     def write_summary(self, summary: dict[str, Any]) -> None:
         """Writes ``summary.json`` (see `executor.recording.summary`)."""

@@ -133,26 +133,12 @@ class AdvertisedSockets:
 
 
 @contextlib.contextmanager
-def advertised() -> Iterator[list[socket.socket]]:
-    """Listens in every usable folder while the block runs.
-
-    Yields:
-        The listening sockets, one per folder.
+def advertised_ahead() -> Iterator[AdvertisedSockets]:
+    """Listens in every usable folder while the block runs, for a motion in preparation.
 
     Raises:
         Refused: No folder is writable, and only by this user.
     """
-    with _advertised(_ENDING) as sockets:
-        yield sockets.listeners
-
-
-def advertised_ahead() -> contextlib.AbstractContextManager[AdvertisedSockets]:
-    """As `advertised`, for a motion that is still being prepared."""
-    return _advertised(_ENDING_AHEAD)
-
-
-@contextlib.contextmanager
-def _advertised(ending: str) -> Iterator[AdvertisedSockets]:
     paths = _made_folders()
     why = "no such folder belongs to this user alone; another user may have created it"
     next_step = "remove it or restrict it (chmod 700), or set XDG_RUNTIME_DIR"
@@ -161,15 +147,15 @@ def _advertised(ending: str) -> Iterator[AdvertisedSockets]:
         listeners, folders = [], []
         for folder in (one.descriptor for one in opened if one.owner == os.getuid()):
             try:
-                listener = stack.enter_context(_listen_in(folder, f"{stem}{ending}"))
+                listener = stack.enter_context(_listen_in(folder, f"{stem}{_ENDING_AHEAD}"))
             except OSError as error:  # such as a file system that is full or read-only
                 why = error.strerror or str(error)
                 next_step = "remove the cause, or set XDG_RUNTIME_DIR to a folder without it"
                 continue
             listeners.append(listener)
             folders.append(folder)
-            for each in {ending, _ENDING}:
-                stack.callback(_try_remove, folder, f"{stem}{each}")
+            for ending in (_ENDING_AHEAD, _ENDING):
+                stack.callback(_try_remove, folder, f"{stem}{ending}")
         if not listeners:
             raise Refused(
                 "`cdpr stop` would not reach this run",

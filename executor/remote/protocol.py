@@ -14,8 +14,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal, Protocol, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
@@ -52,50 +51,37 @@ Cable = Annotated[int, Field(ge=1, le=255)]
 Sense = Literal["wind_in", "pay_out"]
 
 
-class HeldCommand(_Request):
-    """Held jog control: of the platform, with a direction, or of one cable, with a sense."""
+class HeldMotion(BaseModel):
+    """Motion of a held jog control: of the platform by a direction, or of one cable by a sense."""
 
-    command: Literal["held"]
-    press: Number
     direction: Annotated[list[Share], Field(min_length=3, max_length=3)] | None = None
     frame: Frame | None = None
     cable: Cable | None = None
     sense: Sense | None = None
     step_mm: float | None = None
-    percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)] = FASTEST
-    age_ms: Annotated[int, Field(ge=0, le=10_000)] = 0
 
     @model_validator(mode="after")
-    def _one_motion(self) -> HeldCommand:
-        require_one_motion(self.direction, self.frame, self.cable, self.sense)
-        require_step(self.step_mm)
+    def _possible(self) -> Self:
+        if self.direction is None:
+            is_one = None not in (self.cable, self.sense) and self.frame is None
+        else:
+            is_one = (self.cable, self.sense) == (None, None)
+        if not is_one:
+            raise ValueError("a held control has either a direction, or a cable and its sense")
+        if self.direction is not None and math.hypot(*self.direction) < 1e-3:
+            raise ValueError("the direction is zero")
+        if self.step_mm is not None and self.step_mm not in STEPS_MM:
+            raise ValueError(f"step_mm is none of {', '.join(map(str, STEPS_MM))}")
         return self
 
 
-def require_one_motion(
-    direction: Sequence[float] | None, frame: str | None, cable: int | None, sense: str | None
-) -> None:
-    """Requires a motion of either the platform or one cable.
+class HeldCommand(_Request, HeldMotion):
+    """Held jog control."""
 
-    Raises:
-        ValueError: Neither or both are given, or the direction is zero.
-    """
-    if direction is None and None not in (cable, sense) and frame is None:
-        return
-    if direction is None or (cable, sense) != (None, None):
-        raise ValueError("a held control has either a direction, or a cable and its sense")
-    if math.hypot(*direction) < 1e-3:
-        raise ValueError("the direction is zero")
-
-
-def require_step(step_mm: float | None) -> None:
-    """Requires one of `STEPS_MM`, or None.
-
-    Raises:
-        ValueError: There is no such step.
-    """
-    if step_mm is not None and step_mm not in STEPS_MM:
-        raise ValueError(f"step_mm is none of {', '.join(map(str, STEPS_MM))}")
+    command: Literal["held"]
+    press: Number
+    percent: Annotated[int, Field(ge=SLOWEST, le=FASTEST)] = FASTEST
+    age_ms: Annotated[int, Field(ge=0, le=10_000)] = 0
 
 
 class LetGoCommand(_Request):

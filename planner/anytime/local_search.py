@@ -109,7 +109,7 @@ def cost_of(problem: PathProblem, line: Polyline) -> float:
         total += line.edges[i, 0]
         clearance = min(clearance, line.edges[i, 1])
         margin = min(margin, line.edges[i, 2])
-    return total - gained(problem, clearance, margin)
+    return total - gained(problem.terms, clearance, margin)
 
 
 @leaf
@@ -175,7 +175,8 @@ def _gain(
             margin = min(margin, line.edges[i, 2])
     clearance = min(clearance, lows[0], lows[2], lows[4])
     margin = min(margin, lows[1], lows[3], lows[5])
-    return gained(problem, clearance, margin) - gained(problem, old_clearance, old_margin)
+    before = gained(problem.terms, old_clearance, old_margin)
+    return gained(problem.terms, clearance, margin) - before
 
 
 @leaf

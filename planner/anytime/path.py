@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -285,21 +285,6 @@ _REPORT_EVERY = 0.1
 """Between calls of the progress function, [s]."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class OptimalRoute:
-    """A route, and the rounds that reproduce it.
-
-    Attributes:
-        route: The path; its nodes are those of the first path found.
-        rounds: Number of rounds done; `OptimalSettings.rounds` repeats them.
-        search_time: [s].
-    """
-
-    route: Route
-    rounds: int
-    search_time: float
-
-
 def optimal_route(
     rig: Rig,
     scene: Scene,
@@ -307,7 +292,7 @@ def optimal_route(
     kinematic: KinematicCost,
     progress: Progress | None = None,
     clock: Clock = time.perf_counter,
-) -> OptimalRoute:
+) -> Route:
     """Finds a path and improves it until the budget is spent.
 
     Args:
@@ -331,15 +316,8 @@ def optimal_route(
     if path is None:
         raise no_path(rig, scene, problem, search, settings)
     first = search.first[: search.totals[4]].copy()
-    route = Route(
-        path=path,
-        raw=first,
-        nodes=first,
-        parents=np.arange(-1, len(first) - 1, dtype=np.int64),
-        iterations=int(search.totals[0]),
-        edge_checks=int(search.totals[2] + search.grown[2] + search.counts[:, 1].sum()),
-    )
-    return OptimalRoute(route, route.iterations, clock() - prepared)
+    checks = int(search.totals[2] + search.grown[2] + search.counts[:, 1].sum())
+    return Route.from_rounds(path, first, int(search.totals[0]), checks, clock() - prepared)
 
 
 def _load(problem: PathProblem, search: AnytimeSearch) -> None:

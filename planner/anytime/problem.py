@@ -183,13 +183,13 @@ def _clearance(world: World, start: Vector, end: Vector) -> float:
 
 
 @leaf
-def gained(problem: PathProblem, clearance: float, margin: float) -> float:
+def gained(weights: Array, clearance: float, margin: float) -> float:
     """The amount by which a path's smallest clearance and margin reduce its cost."""
     gain = 0.0
-    if problem.terms[CLEARANCE] > 0.0 and clearance < math.inf:
-        gain += problem.terms[CLEARANCE] * clearance
-    if problem.terms[CAPACITY] > 0.0 and margin < math.inf:
-        gain += problem.terms[CAPACITY] * margin
+    if weights[CLEARANCE] > 0.0 and clearance < math.inf:
+        gain += weights[CLEARANCE] * clearance
+    if weights[CAPACITY] > 0.0 and margin < math.inf:
+        gain += weights[CAPACITY] * margin
     return gain
 
 

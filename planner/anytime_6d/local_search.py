@@ -12,12 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planner.anytime.problem import CAPACITY, CLEARANCE, KINEMATIC, gained
 from planner.anytime_6d.problem import (
-    CAPACITY,
-    CLEARANCE,
-    KINEMATIC,
     RotatingProblem,
-    gained,
     move_allowed,
     move_length,
     move_lows,
@@ -89,7 +86,7 @@ def measure(problem: RotatingProblem, line: Line) -> float:
 def line_cost(problem: RotatingProblem, line: Line) -> float:
     """The cost of a path whose moves are measured."""
     clearance, margin = _lows(line, 0, 0)
-    return _sums(line) - gained(problem.objective, clearance, margin)
+    return _sums(line) - gained(problem.objective.weights, clearance, margin)
 
 
 @kernel
@@ -170,11 +167,12 @@ def _lows(line: Line, first: int, last: int) -> tuple[float, float]:
 @kernel
 def _gain(problem: RotatingProblem, line: Line, first: int, last: int, worth: Array) -> float:
     """The gain of a change in the smallest clearance and margin of the whole path."""
-    before = gained(problem.objective, *_lows(line, 0, 0))
+    weights = problem.objective.weights
+    before = gained(weights, *_lows(line, 0, 0))
     clearance, margin = _lows(line, first, last)
     for i in range(len(worth)):
         clearance, margin = min(clearance, worth[i, 1]), min(margin, worth[i, 2])
-    return gained(problem.objective, clearance, margin) - before
+    return gained(weights, clearance, margin) - before
 
 
 @kernel

@@ -186,21 +186,6 @@ _ROTATION_ROUND_OFF = 2.5e-6
 2e-6; the check tolerates 3e-6."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RotatingRoute:
-    """A route, and the rounds that reproduce it.
-
-    Attributes:
-        route: The path in `planner.space.PoseSpace`.
-        rounds: Number of rounds done; `TurningSettings.rounds` repeats them.
-        search_time: [s].
-    """
-
-    route: Route
-    rounds: int
-    search_time: float
-
-
 def rotating_problem(
     rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCost
 ) -> RotatingProblem:
@@ -237,8 +222,8 @@ def rotating_route(
     kinematic: KinematicCost,
     progress: Progress | None = None,
     clock: Clock = time.perf_counter,
-) -> RotatingRoute:
-    """Finds a path and improves it until the budget is spent.
+) -> Route:
+    """Finds a path in `PoseSpace` and improves it until the budget is spent.
 
     Args:
         rig: The robot.
@@ -272,15 +257,8 @@ def rotating_route(
     path = search.path if limit is None else limit.path
     if path is None:
         raise _no_path(scene, search, settings)
-    route = Route(
-        path=path,
-        raw=search.first,
-        nodes=search.first,
-        parents=np.arange(-1, len(search.first) - 1, dtype=np.int64),
-        iterations=search.rounds,
-        edge_checks=int(search.tallies.sum()),
-    )
-    return RotatingRoute(route, search.rounds, clock() - began)
+    checks = int(search.tallies.sum())
+    return Route.from_rounds(path, search.first, search.rounds, checks, clock() - began)
 
 
 def _load(search: RotatingSearch, weights: Weights) -> None:

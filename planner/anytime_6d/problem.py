@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.statics.wrench_sets import rms_anchor_radius
+from planner.anytime.problem import CAPACITY, CLEARANCE, KINEMATIC, LENGTH
 from planner.collision.self_collision_regions import Robot
 from planner.collision.swept_pair import points_distance, put_corners
 from planner.costs import KinematicCost
@@ -188,9 +189,6 @@ def _room_at_planes(world: World, pair: int, points: Array) -> float:
 # proves the limits.
 
 
-LENGTH, KINEMATIC, CLEARANCE, CAPACITY = 0, 1, 2, 3
-"""Indices into `Objective.weights`."""
-
 _SAMPLING = 0.015
 """Spacing of poses at which c is computed, rotation counted, [m]."""
 _LOW_SAMPLING = 0.020
@@ -202,7 +200,7 @@ class Objective(NamedTuple):
 
     Attributes:
         weights: Of length, ∫c ds, smallest clearance and smallest margin (the last two reduce the
-            cost), shape (4,).
+            cost), shape (4,), indexed as `planner.anytime.problem.PathProblem.terms`.
         extremes: Smallest and largest condition number, and inverse volume of the force set, by
             which c is scaled, shape (2, 2).
         triples: Three cables for each part of the volume, shape (k, 3).
@@ -316,17 +314,6 @@ def move_lows(
         if watches_margin:
             margin = min(margin, margin_at(world, load_at(load, rotation), rotation, at))
     return clearance, margin
-
-
-@kernel
-def gained(objective: Objective, clearance: float, margin: float) -> float:
-    """The amount by which a path's smallest clearance and margin reduce its cost."""
-    gain = 0.0
-    if objective.weights[CLEARANCE] > 0.0 and clearance < math.inf:
-        gain += objective.weights[CLEARANCE] * clearance
-    if objective.weights[CAPACITY] > 0.0 and margin < math.inf:
-        gain += objective.weights[CAPACITY] * margin
-    return gain
 
 
 # The problem, and the limits of a move.

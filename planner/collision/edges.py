@@ -44,15 +44,6 @@ def edge_free(world: World, start: Array, end: Array) -> bool:
     return obstacles_free(world, before, after)
 
 
-@kernel
-def edges_free(world: World, starts: Array, ends: Array) -> NDArray[np.bool_]:
-    """`edge_free` for many edges, shape (k, 3) each, [m]; shape (k,)."""
-    free = np.empty(len(starts), dtype=np.bool_)
-    for i in range(len(starts)):
-        free[i] = edge_free(world, starts[i], ends[i])
-    return free
-
-
 @leaf
 def edge_clearance(world: World, start: Array, end: Array) -> tuple[float, int, int]:
     """The smallest distance of any body to any obstacle along an edge, exact.

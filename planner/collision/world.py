@@ -6,7 +6,6 @@ Pairs of a body and a piece have planes in position space: `planner.collision.se
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from model.clearance import SelfModel
 from model.errors import BadInput
@@ -283,12 +282,3 @@ def _clear(
         lows[waiting + 1], highs[waiting + 1] = low, middle
         waiting += 2
     return True
-
-
-@kernel
-def self_edges_free(world: World, robot: Robot, starts: Array, ends: Array) -> NDArray[np.bool_]:
-    """`self_edge_free` for many edges, shape (k, 3) each, [m]; shape (k,)."""
-    free = np.empty(len(starts), dtype=np.bool_)
-    for i in range(len(starts)):
-        free[i] = self_edge_free(world, robot, starts[i], ends[i])
-    return free

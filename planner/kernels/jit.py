@@ -7,17 +7,17 @@ be written, arrays are recomputed.
 
 from __future__ import annotations
 
-import os
-import tempfile
+import io
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from model.files.documents import content_hash
+from model.errors import BadInput
+from model.files.documents import content_hash, write_bytes_atomic
 from model.jit import KernelSet, cache_folder, compilation, compiled
 from model.progress import Listener
 
@@ -89,7 +89,10 @@ def stored(
     except (OSError, ValueError, EOFError):  # missing or truncated: recomputed below
         pass
     made = compute()
-    _keep(path, made)
+    content = io.BytesIO()
+    np.save(content, made)
+    with suppress(BadInput):  # the folder cannot be written
+        write_bytes_atomic(path, content.getvalue())
     _forget_oldest(folder, name)
     return made
 
@@ -101,16 +104,3 @@ def _forget_oldest(folder: Path, name: str) -> None:
             file.unlink()
     except OSError:  # another process was faster, or the file is not ours
         return
-
-
-def _keep(path: Path, array: NDArray[Any]) -> None:
-    """Writes a file atomically; does nothing where the cache cannot be written."""
-    temporary = ""
-    try:
-        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            temporary = file.name
-            np.save(file, array)
-        os.replace(temporary, path)
-    except OSError:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)

@@ -218,7 +218,7 @@ def pieces_of(scene: Scene) -> tuple[ConvexPiece, ...]:
 def _piece(obstacle: Obstacle, owner: int) -> ConvexPiece:
     shape, pose = obstacle.shape, obstacle.pose
     points = pose.apply(shape_points(shape))
-    kind, half, radius, disc = _sizes(shape, points)
+    kind, half, radius, disc = _sizes(shape)
     faces, edges = _features(shape, points, pose)
     triangles = np.zeros((0, 3, 3))
     if kind == MESH and isinstance(shape, TriangleMesh):
@@ -226,7 +226,7 @@ def _piece(obstacle: Obstacle, owner: int) -> ConvexPiece:
     return ConvexPiece(kind, pose, half, points, radius, disc, faces, edges, triangles, owner)
 
 
-def _sizes(shape: Shape, points: Array) -> tuple[int, Array, float, float]:
+def _sizes(shape: Shape) -> tuple[int, Array, float, float]:
     none = np.zeros(3)
     match shape:
         case Box(half_size=half):

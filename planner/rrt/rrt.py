@@ -251,7 +251,7 @@ def extend_tree(
             for k in range(len(nodes)):
                 path[k] = tree.points[nodes[k]]
             spread = rules.neighbour_radius
-            wanted = near_path(random, tree, path, spread, task.lower, task.upper)
+            wanted = near_path(random, path, spread, task.lower, task.upper)
         node = _grow(search, task, rules, wanted)
         if node >= 0:
             away = math.sqrt(squared_distance(tree.points, node, task.goal))

@@ -90,9 +90,7 @@ def backward(
 
 
 @kernel
-def near_path(
-    random: Generator, tree: Tree, path: Array, spread: float, lower: Array, upper: Array
-) -> Array:
+def near_path(random: Generator, path: Array, spread: float, lower: Array, upper: Array) -> Array:
     """A sample near a path, shape (k, n), k ≥ 2, where new nodes can make it cheaper."""
     k = random.integers(0, len(path) - 1)
     share = random.random()

@@ -102,17 +102,6 @@ def edge_held(world: World, load: LoadArrays, holding: Holding, start: Array, en
 
 
 @kernel
-def edges_held(
-    world: World, load: LoadArrays, holding: Holding, starts: Array, ends: Array
-) -> NDArray[np.bool_]:
-    """`edge_held` for many edges, shape (k, 3) each, [m]; shape (k,)."""
-    held = np.empty(len(starts), dtype=np.bool_)
-    for i in range(len(starts)):
-        held[i] = edge_held(world, load, holding, starts[i], ends[i])
-    return held
-
-
-@kernel
 def line_held(
     world: World, load: LoadArrays, reserve: float, middle: Vector, off: Vector, radius: float
 ) -> int:

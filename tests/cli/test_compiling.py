@@ -18,7 +18,7 @@ def test_the_edge_finder_is_compiled_before_processes_begin_unless_it_is_there(
     monkeypatch.setattr(machine_code, "is_compiled", lambda task: is_there)
     monkeypatch.setattr(machine_code, "note_compiled", lambda task: None)
     monkeypatch.setattr(edges, "load_kernels", lambda: loaded.append("edges"))
-    kernels.ready_for_camera_processes(Terminal(quiet=True))
+    kernels.ready_to_measure(Terminal(quiet=True), only_missing=True)
     assert loaded == ([] if is_there else ["edges"])
     assert ("compiling the tag edge detector" in capsys.readouterr().err) == (not is_there)
 

@@ -28,7 +28,7 @@ from executor.hold_to_run.session import jog_session
 from executor.remote import client
 from executor.remote.client import StopResult, follow_run
 from executor.remote.command_server import serving
-from executor.remote.command_socket import RunConnection, advertised
+from executor.remote.command_socket import RunConnection
 from executor.remote.protocol import make_line, parse_command
 from executor.remote.status import WinchStatus
 from executor.state_machine import CycleRecord, State
@@ -40,6 +40,7 @@ from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.cli.test_monitor import status
 from tests.executor import fake_run
+from tests.executor.sockets import advertised
 
 SENT = {name: b"\x1b[" + code for code, name in NAMES.items()} | {
     sign: sign.encode() for sign in " hrq+-f"

@@ -61,7 +61,6 @@ from executor.interlock.fault_latch import FaultLatch
 from executor.remote.client import preparations, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
-from executor.remote.command_socket import advertised
 from executor.remote.status import bus_name, identity
 from executor.run_result import RunResult
 from executor.state_machine import State
@@ -76,6 +75,7 @@ from tests.cli.program import call
 from tests.console import fake_server
 from tests.console.cut import acknowledgement, receive
 from tests.console.sequences import arrived_now
+from tests.executor.sockets import advertised
 
 
 def wanted() -> None:
@@ -1056,7 +1056,7 @@ def test_a_run_is_followed_rather_than_a_motion_in_preparation(
 RUN_ELSEWHERE = """
 from types import SimpleNamespace
 from executor.remote.command_server import serving
-from executor.remote.command_socket import advertised
+from tests.executor.sockets import advertised
 from executor.supervision import LocalRequests, Supervisor
 status = SimpleNamespace(as_dict=lambda: {{"bus": {bus!r}, "rig": {rig!r}}})
 with advertised() as listeners, serving(listeners, LocalRequests(), status):

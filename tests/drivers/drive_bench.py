@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from drivers.can_bus import BusSettings, open_bus
-from drivers.cia402.pdo import parse_set_point
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
 from model.kinematics import cable_lengths
 from model.pose import Pose
@@ -25,6 +24,11 @@ from simulation.drives.cia402_rig import SimulatedCia402Rig
 def make_reply(status_word: int, position: int, torque: int) -> bytes:
     """TPDO1: 6041h status word, 6064h position actual [counts], 6077h torque [per mille]."""
     return struct.pack("<Hih", status_word, position, torque)
+
+
+def parse_set_point(data: bytes | bytearray) -> tuple[int, int] | None:
+    """Control word and target of an RPDO1; None if the length is wrong."""
+    return struct.unpack("<Hi", data) if len(data) == 6 else None
 
 
 class Bench:

@@ -76,9 +76,9 @@ def write(run: FakeRun, path: Path, pictures: bool = True) -> RunFolder:
             for k in range(len(poses))
         ]
         poses = replace(poses, picture=tuple(names))
-    folder.write_cycles(run.cycles)
-    folder.write_poses(poses)
-    folder.write_clearance(run.clearance)
+    folder.write_table("cycles.csv", run.cycles)
+    folder.write_table("poses.csv", poses)
+    folder.write_table("clearance.csv", run.clearance)
     for event in run.context.events:
         folder.append_event(event)
     folder.write_summary(run.summary)
@@ -132,7 +132,7 @@ def make_plan(rig: Rig, scene: Scene) -> Plan:
     nodes, parents = [np.array(CORNERS_MM[0])], [-1]
     while len(nodes) < 400:
         aim = random.uniform([-250, -250, 150], [250, 250, 650])
-        near = int(np.argmin([np.linalg.norm(aim - n) for n in nodes]))
+        near = int(np.argmin(np.linalg.norm(np.array(nodes) - aim, axis=1)))
         step = aim - nodes[near]
         nodes.append(nodes[near] + step * min(1.0, 40.0 / float(np.linalg.norm(step))))
         parents.append(near)

@@ -19,10 +19,11 @@ from hypothesis import strategies as st
 
 from executor.remote.client import ask_all, final_status, no_answer, select_run, stop_runs
 from executor.remote.command_server import LONGEST_REQUEST, MOST_CLIENTS, serving
-from executor.remote.command_socket import RunConnection, advertised, find_runs
+from executor.remote.command_socket import RunConnection, find_runs
 from executor.remote.protocol import InvalidCommand, answer_to, make_line, parse_command
 from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput, Fault
+from tests.executor.sockets import advertised
 
 
 class _Status:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,10 +15,9 @@ from executor.control.sync_master import SyncMaster
 from executor.realtime.scheduling import SimulatedClock
 from executor.safety.gate import Purpose
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
-from model.rig import load_rig
+from tests.configs import HALL
 
 #: Its ten winches have the node ids 11 to 20.
-HALL = load_rig(Path(__file__).parents[2] / "configs" / "hall_10_6.yaml")
 HOME = np.array([[winch.home_counts for winch in HALL.winches]], dtype=np.int32)
 
 

@@ -235,7 +235,7 @@ def test_each_camera_is_compared_with_the_plan_by_the_same_images_as_all(
     )
     folder = fake_run.write(made, tmp_path / "run", pictures=False)
     for camera, table in (("front", poses), ("blind", PoseTable.empty())):
-        folder.write_poses_of(camera, table)
+        folder.write_table(f"poses-{camera}.csv", table)
     rms = made.summary["tag_error_mm"]["rms"]  # type: ignore[index]
     rows = re.findall(r"<tr>(.*?)</tr>", camera_table(read_run(folder)))
     assert f"{rms:.2f} mm RMS" in rows[1]

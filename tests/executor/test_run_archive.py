@@ -242,7 +242,7 @@ def test_files_named_like_poses_of_a_camera_do_no_harm(
     folder = fake_run.write(replace(run, context=context), tmp_path / "run")
     alone = dict.fromkeys(used, folder.poses()) if len(used) > 1 else {}
     for name, table in alone.items():
-        folder.write_poses_of(name, table)
+        folder.write_table(f"poses-{name}.csv", table)
     (folder.path / "poses-tracked.csv").write_text("picture,x_mm\na.jpg,1\n")
     shutil.copy(folder.path / "poses.csv", folder.path / "poses-backup.csv")
     rewrite_report(RunFolder.open_cut_short(folder.path))
@@ -259,7 +259,7 @@ def test_poses_of_a_camera_that_are_missing_are_named(tmp_path: Path) -> None:
     cameras = tuple(CameraRecord(name, "0", 9, 9, 0, 2.0, "") for name in ("front", "side"))
     context = fake_run.changed(run.context, cameras=cameras)
     folder = fake_run.write(replace(run, context=context), tmp_path / "run")
-    folder.write_poses_of("side", folder.poses())
+    folder.write_table("poses-side.csv", folder.poses())
     with pytest.raises(BadInput, match="camera 'front' took no images"):
         poses_of_run(folder.path, "front")
 

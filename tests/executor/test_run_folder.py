@@ -179,7 +179,7 @@ def test_cycles_of_a_rig_with_other_cables_are_refused(
 ) -> None:
     folder = RunFolder.create(tmp_path / "run")
     folder.write_rig(run.context.rig.document)
-    folder.write_cycles(run.cycles)
+    folder.write_table("cycles.csv", run.cycles)
     path = folder.path / "cycles.csv"
     path.write_text(path.read_text().replace("set_8_counts", "set_8_count", 1))
     message = "cycles.csv has 7 cables, rig.json has 8"
@@ -463,13 +463,13 @@ def test_the_type_of_a_column_depends_on_its_name_only(
         ),
     )
     bare = RunFolder.create(tmp_path / "numbered")
-    bare.write_cycles(numbered.cycles)
-    bare.write_poses(numbered.poses)
-    bare.write_clearance(numbered.clearance)
+    bare.write_table("cycles.csv", numbered.cycles)
+    bare.write_table("poses.csv", numbered.poses)
+    bare.write_table("clearance.csv", numbered.clearance)
     empty = RunFolder.create(tmp_path / "empty")
-    empty.write_cycles(CycleTable.empty(run.cycles.cable_count))
-    empty.write_poses(PoseTable.empty())
-    empty.write_clearance(no_clearance(run.clearance.obstacles))
+    empty.write_table("cycles.csv", CycleTable.empty(run.cycles.cable_count))
+    empty.write_table("poses.csv", PoseTable.empty())
+    empty.write_table("clearance.csv", no_clearance(run.clearance.obstacles))
     kinds = table_kinds(full)
     assert table_kinds(RunResult(bare.path, {})) == kinds
     assert table_kinds(RunResult(empty.path, {})) == kinds

@@ -31,18 +31,19 @@ from executor.hold_to_run import session
 from executor.remote import command_socket
 from executor.remote.client import StopResult, ask_all, final_status, stop_runs
 from executor.remote.command_server import commands_from_start
-from executor.remote.command_socket import advertised, find_runs, is_stopped_since, record_stop
+from executor.remote.command_socket import find_runs, is_stopped_since, record_stop
 from executor.remote.status import WinchStatus
 from executor.supervision import LocalRequests, OperatorRequests, Supervisor
 from model.errors import Refused, StoppedByOperator
 from model.rig import load_rig
 from tests.executor import fake_run
+from tests.executor.sockets import advertised
 
 #: A run as made by the command line: prints that it is advertised, ends on request.
 RUN = """
 import signal
 from cdpr.cli.operate.supervision import stop_requests
-from executor.remote.command_socket import advertised
+from tests.executor.sockets import advertised
 from executor.supervision import LocalRequests
 board = LocalRequests()
 with stop_requests(board), advertised() as listeners:
@@ -153,6 +154,8 @@ def test_a_run_that_was_killed_is_not_reached_and_its_name_is_cleared_away(folde
         process.wait()
         assert all(list(folder.iterdir()) for folder in folders)
         assert _reached() == []
+        with find_runs(ahead=True) as runs:
+            assert runs == []
         assert not any(list(folder.iterdir()) for folder in folders)
 
 
@@ -174,7 +177,7 @@ def test_several_runs_of_one_process_are_reached_each_until_its_own_end(folders)
             second.close()
             assert _reached() == [pid] * 2
             second.enter_context(advertised())
-            names = [path.name for path in folders[0].iterdir()]
+            names = [path.name for path in folders[0].glob("*[0-9].sock")]
             assert sorted(names) == [f"{pid}-2.sock", f"{pid}-3.sock", f"{pid}.sock"]
         assert _reached() == [pid] * 2
     assert _reached() == []
@@ -218,9 +221,8 @@ def test_names_of_other_things_are_left_alone(folders):
 def test_folder_and_socket_are_closed_to_others(folders):
     with advertised():
         for folder in folders:
-            (file,) = folder.iterdir()
             assert folder.stat().st_mode & 0o777 == 0o700
-            assert file.stat().st_mode & 0o077 == 0
+            assert [file.stat().st_mode & 0o077 for file in folder.iterdir()] == [0, 0]
 
 
 READ_ONLY = OSError(errno.EROFS, "Read-only file system")
@@ -284,7 +286,7 @@ def test_a_link_instead_of_the_socket_is_not_followed(folders, tmp_path):
     precious = tmp_path / "precious"
     precious.write_text("mine")
     folders[0].mkdir(mode=0o700)
-    for ending in ("sock", "sock.new"):
+    for ending in ("sock", "preparing.sock", "preparing.sock.new"):
         (folders[0] / f"{os.getpid()}.{ending}").symlink_to(precious)
     with advertised():
         assert _reached() == [os.getpid()]
@@ -325,7 +327,8 @@ def test_a_folder_that_others_control_is_not_used_while_there_is_another(
     safe, doubtful = folders
     _spoil(doubtful, how, tmp_path, monkeypatch)
     with advertised():
-        assert [path.name for path in safe.iterdir()] == [f"{os.getpid()}.sock"]
+        names = [path.name for path in safe.iterdir()]
+        assert sorted(names) == [f"{os.getpid()}{ending}.sock" for ending in (".preparing", "")]
         assert list(doubtful.iterdir()) == []
 
 

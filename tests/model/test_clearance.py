@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import coal
 import numpy as np
 import pytest
@@ -23,13 +21,11 @@ from model.distances import (
 from model.files.scene_file import SceneDocument
 from model.kinematics import cables_at
 from model.pose import Pose, interpolate
-from model.rig import load_rig, rig_from_document
+from model.rig import rig_from_document
 from model.scene import load_scene, scene_from_document
 from model.shapes import Box, Capsule, Cylinder, Sphere, TriangleMesh, convex_hull
+from tests.configs import CONFIGS, GACHON, HALL
 
-CONFIGS = Path(__file__).parents[2] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from model.rig import load_rig
 from model.scene import load_scene
 from planner.edge_checks import FREE, OBSTACLE, SELF, WORKSPACE, WRENCH, ExactChecks
+from tests.configs import GACHON
 
 ROOT = Path(__file__).parents[2]
-GACHON = load_rig(ROOT / "configs" / "gachon_8_6.yaml")
 SCENE = load_scene(ROOT / "configs" / "environment_1.yaml")
 HOME = GACHON.home.position
 
@@ -32,13 +31,8 @@ def test_every_reason_is_reported() -> None:
     assert checks(margin_reserve=50.0).problem(HOME, aside) == WRENCH
 
 
-def test_many_edges_and_frozen_arrays_are_taken_as_one_by_one() -> None:
-    made = checks()
-    starts = np.stack([SCENE.start.position, HOME])
-    ends = np.stack([SCENE.goal.position, HOME])
-    found = made.problems(starts, ends).tolist()
-    assert found == [made.problem(a, b) for a, b in zip(starts, ends, strict=True)]
-    distance, body, obstacle = made.clearance(SCENE.start.position, SCENE.start.position)
+def test_clearance_is_that_of_the_nearest_body_and_obstacle() -> None:
+    distance, body, obstacle = checks().clearance(SCENE.start.position, SCENE.start.position)
     assert (round(distance, 4), body, obstacle) == (0.0322, 6, 0)
 
 

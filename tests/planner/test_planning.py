@@ -461,7 +461,7 @@ def test_a_path_near_a_pulleys_axis_is_refused_by_cable_and_pose(hall, monkeypat
     scene = empty_scene(rig).changed(start=start, goal=goal)
     line = np.array([start.position, goal.position])
     route = Route(line, line, nodes=line, parents=np.array([-1, 0]), iterations=1, edge_checks=1)
-    found = planning.MultiSegmentPath(route, (), (1,), 0.0)
+    found = planning.MultiSegmentPath(route, (), (1,))
     monkeypatch.setattr(planning, "plan_segments", lambda *_: found)
     with pytest.raises(BadInput, match=r"^.*cable 5 .* pulley's axis.*at \[.*, 450.0, 1100.0\] mm"):
         make_plan(rig, scene)

@@ -60,10 +60,6 @@ def silence(drive: int) -> Callable[[Stage], object]:
     return lambda stage: setattr(stage.drives[drive], "silent", True)
 
 
-def jam(stage: Stage) -> None:
-    stage.drives[1].motor.jammed = True
-
-
 def slip(stage: Stage) -> None:
     """3 mm of cable run off the drum, which then sticks."""
     per_metre = stage.prepared.rig.winches[1].counts_per_metre
@@ -71,21 +67,8 @@ def slip(stage: Stage) -> None:
     stage.drives[1].motor.jammed = True
 
 
-def tear(stage: Stage) -> None:
-    """The cable's motor has no load any more."""
-    stage.rehearsal.per_newton[5] = 0.0
-
-
-def overload(stage: Stage) -> None:
-    stage.rehearsal.per_newton[5] *= 6.0
-
-
 def late(stage: Stage) -> None:
     stage.lateness = 1.4
-
-
-def far_too_late(stage: Stage) -> None:
-    stage.lateness = 1371.9
 
 
 def jump_in_table(stage: Stage) -> None:
@@ -120,13 +103,8 @@ def no_heartbeat(stage: Stage) -> None:
     stage.drives[2]._heartbeat_period = 0.0
 
 
+#: Those that the fault table lacks (`tests.scenarios.faults`), and one that it has.
 CASES = {
-    "a drive falls silent": Case(
-        silence(3), "drive_silent", ("(drive 4) did not answer",), lost=(3,)
-    ),
-    "a drive reports an emergency": Case(
-        lambda stage: stage.drives[2].fail(0x2310), "drive_fault", ("drive 3",), lost=(2,)
-    ),
     "a drive reports an emergency and goes on": Case(
         lambda stage: stage.drives[2]._emergency(0x4310),
         "drive_fault",
@@ -141,15 +119,8 @@ CASES = {
     "the heartbeat of a drive ceases": Case(
         no_heartbeat, "drive_fault", ("(drive 3) sends no heartbeat",), within=12
     ),
-    "a drive restarts": Case(
-        lambda stage: stage.drives[0].power_on(), "drive_fault", ("drive 1",), lost=(0,)
-    ),
-    "a winch jams": Case(jam, "drive_stuck", ("(drive 2) did not move",), lost=(1,)),
     "a winch slips": Case(slip, "following_error", ("cable 2", "limit 2.00 mm"), lost=(1,)),
-    "a cable tears": Case(tear, "cable_loose", ("cable 6 carries 0.0 N", "broken"), within=5),
-    "a cable is overloaded": Case(overload, "over_tension", ("cable 6", "102.0 N"), within=60),
     "the loop is late": Case(late, "late", ("1.4 cycles late; stopped along",), within=40),
-    "the loop hung": Case(far_too_late, "late", ("1371.9 cycles late; quick stop",)),
     "the table was changed": Case(jump_in_table, "gate_denied", ("cable 4", "step"), within=30),
     "a drive is silent while enabling": Case(
         silence(6), "drive_silent", ("(drive 7) did not answer",), cycle=1, lost=(6,)

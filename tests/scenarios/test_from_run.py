@@ -248,7 +248,7 @@ def test_drives_that_contradict_the_plan_or_each_other_are_refused(
         change[cable] = off_mm / 1e3
     counts = cycles.actual_counts.copy()
     counts[-1] += np.rint(change * per_metre).astype(np.int64)
-    folder.write_cycles(replace(cycles, actual_counts=counts))
+    folder.write_table("cycles.csv", replace(cycles, actual_counts=counts))
     out = tmp_path / "plan.json"
     answer = call("plan", RIG, scene_file, "-o", out, "--from-run", folder.path)
     one_message(answer, 3, "the platform pose is unknown", words, "--start-mm")
@@ -263,7 +263,7 @@ def test_a_folder_without_its_cycles_or_with_silent_drives_is_refused(
     cycles = folder.cycles()
     missing = cycles.missing.copy()
     missing[-1] = 2
-    folder.write_cycles(replace(cycles, missing=missing))
+    folder.write_table("cycles.csv", replace(cycles, missing=missing))
     one_message(call(*arguments), 3, "2 drives did not answer in the last cycle")
     (folder.path / "cycles.csv").unlink()
     one_message(call(*arguments), 2, "incomplete run folder", "cycles.csv missing")

@@ -28,6 +28,7 @@ from executor.interlock.fault_latch import FaultLatch
 from executor.recording.record_files import RunCourse
 from executor.recording.resume import run_end
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
+from executor.recording.table_files import Table
 from executor.remote.client import ask_all
 from executor.remote.command_socket import find_runs
 from executor.trajectory.setpoints import PreparedRun
@@ -145,7 +146,7 @@ def at_rest(killed: RunFolder, tmp_path: Path) -> RunFolder:
     """Its cycles reach up to its end, its ``run.json`` does not."""
     folder = cut(killed, tmp_path / "run")
     cycles = folder.cycles()
-    folder.write_cycles(replace(cycles, state=(*cycles.state[:-1], "securing")))
+    folder.write_table("cycles.csv", replace(cycles, state=(*cycles.state[:-1], "securing")))
     folder.write_events([RunEvent(0.0, "enabled", "all hold"), RunEvent(0.1, "moving", "moving")])
     return folder
 
@@ -309,9 +310,13 @@ def test_a_run_that_is_active_has_no_report_yet(killed: RunFolder, tmp_path: Pat
 def test_what_a_program_wrote_while_it_ran_is_what_it_writes_at_the_end(
     short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "executor.recording.run_folder.RunFolder.write_cycles", lambda _self, _table: None
-    )
+    write_table = RunFolder.write_table
+
+    def not_cycles(folder: RunFolder, name: str, table: Table) -> None:
+        if name != "cycles.csv":
+            write_table(folder, name, table)
+
+    monkeypatch.setattr(RunFolder, "write_table", not_cycles)
     run = ("run", short_plan, "--rig", RIG, "--fast", "--no-camera", "-o")
     assert call(*run, tmp_path / "appended").code == 0
     monkeypatch.undo()

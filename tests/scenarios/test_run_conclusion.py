@@ -18,6 +18,7 @@ import executor.evaluation
 import executor.recording.summary
 import executor.runner
 from executor.recording.run_folder import RunFolder
+from executor.recording.table_files import Table
 from executor.supervision import LocalRequests, OperatorRequests
 from model.errors import BadInput
 from tests.cli.plans import RIG
@@ -199,11 +200,16 @@ def test_ctrl_c_while_the_report_is_made_ends_with_the_verdict_of_the_run(
         os.kill(os.getpid(), signal.SIGINT)
         return summarize(*arguments)  # type: ignore[arg-type]
 
-    def pressed(_self: RunFolder, _table: object) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
+    write_table = RunFolder.write_table
+
+    def pressed(folder: RunFolder, name: str, table: Table) -> None:
+        if name == "poses.csv":
+            os.kill(os.getpid(), signal.SIGINT)
+        else:
+            write_table(folder, name, table)
 
     monkeypatch.setattr(executor.evaluation, "summarize", pressed_before)
-    monkeypatch.setattr(RunFolder, "write_poses", pressed)
+    monkeypatch.setattr(RunFolder, "write_table", pressed)
     answer = run(end)
     assert_verdict(answer, end)
     assert "fused.csv, run.mcap, report.html: interrupted" in answer.err
@@ -221,12 +227,13 @@ def test_ctrl_c_again_leaves_at_once_with_the_exit_code_of_the_run(
         codes.append(code)
         raise Left
 
-    def pressed(_self: RunFolder, _table: object) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-        os.kill(os.getpid(), signal.SIGTERM)
+    def pressed(_folder: RunFolder, name: str, _table: object) -> None:
+        if name == "poses.csv":
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGTERM)
 
     monkeypatch.setattr(os, "_exit", left)
-    monkeypatch.setattr(RunFolder, "write_poses", pressed)
+    monkeypatch.setattr(RunFolder, "write_table", pressed)
     with pytest.raises(Left):
         run("stop")
     assert codes == [130]

@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from model.errors import Fault
 from model.files.rig_file import RigDocument
 from model.kinematics import cable_lengths, structure_matrix
-from model.pose import Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
 from model.scene import Load
 from model.statics.gravity import weight_wrench, working_tensions
@@ -32,6 +32,11 @@ def pose_in(rig: Rig, fraction: tuple[float, ...], rotation: tuple[float, ...]) 
     return Pose(
         rig.workspace_lower + np.array(fraction) * span, matrix_from_rotation_vector(rotation)
     )
+
+
+def counts_for(plant: Plant, rig: Rig, pose: Pose, tensions: Array) -> Array:
+    """Drive positions for a pose with given tensions, not rounded."""
+    return plant.winch_map.counts(plant.winch_map.unstrained(cable_lengths(rig, pose), tensions))
 
 
 def changed(rig: Rig, part: str, **values: object) -> Rig:
@@ -57,7 +62,7 @@ def test_drums_wound_for_a_pose_hold_the_platform_there(
     except TensionInfeasible:
         reject()
     plant = Plant(robot, robot.home)
-    plant.settle_counts(plant.counts_for(pose, tensions))
+    plant.settle_counts(counts_for(plant, robot, pose, tensions))
     assert plant.pose.distance_to(pose) < 1e-9
     assert plant.pose.angle_to(pose) < 1e-8
     assert plant.tensions == pytest.approx(tensions, abs=1e-4)
@@ -70,7 +75,7 @@ def test_home_counts_hold_the_platform_at_home(rig: Rig) -> None:
     document = rig.document.model_dump() | {"winches": shifted}
     robot = rig_from_document(RigDocument.model_validate(document))
     plant = Plant(robot, robot.home)
-    counts = plant.counts_for(robot.home, working_tensions(robot, robot.home).tensions)
+    counts = counts_for(plant, robot, robot.home, working_tensions(robot, robot.home).tensions)
     assert counts == pytest.approx([1000.0 * i for i in range(8)], abs=1e-6)
 
 
@@ -84,7 +89,7 @@ def test_cables_and_weight_balance_whatever_the_drums_do(
     """Slack or taut, forces and moments add up to nothing and no cable pushes."""
     pose = pose_in(rig, fraction, (0.0, 0.0, 0.0))
     plant = Plant(rig, pose)
-    counts = plant.counts_for(pose, plant.tensions)
+    counts = counts_for(plant, rig, pose, plant.tensions)
     plant.settle_counts(counts + np.array(shifts) * [w.counts_per_metre for w in rig.winches])
     wrench = structure_matrix(rig, plant.pose) @ plant.tensions + weight_wrench(rig, plant.pose)
     assert np.abs(wrench).max() < 1e-6
@@ -128,7 +133,7 @@ def test_stiff_cables_are_inverse_kinematics(rig: Rig) -> None:
     for stiffness in (1e6, 1e8):
         robot = changed(rig, "cables", stiffness_n=stiffness)
         plant = Plant(robot, robot.home)
-        counts = plant.counts_for(robot.home, plant.tensions)
+        counts = counts_for(plant, robot, robot.home, plant.tensions)
         # A little shorter everywhere: pretension instead of rounding decides the rest.
         shorter = drums - 1.0 / stiffness
         plant.settle_counts(counts + shorter * [w.counts_per_metre for w in robot.winches])
@@ -143,7 +148,7 @@ def test_the_stiffest_cables_of_a_rig_file_settle(rig: Rig, stiffness: float) ->
     robot = changed(rig, "cables", stiffness_n=stiffness)
     goal = Pose.level(robot.home.position + np.array([0.05, -0.03, 0.04]))
     plant = Plant(robot, robot.home)
-    plant.settle_counts(plant.counts_for(goal, working_tensions(robot, goal).tensions))
+    plant.settle_counts(counts_for(plant, robot, goal, working_tensions(robot, goal).tensions))
     assert plant.pose.distance_to(goal) < 1e-9
 
 
@@ -153,7 +158,7 @@ def test_a_known_load_lowers_the_platform_by_force_over_stiffness(rig: Rig) -> N
     load = Load(mass, np.zeros(3), np.zeros(3), np.zeros(3))
     tensions = working_tensions(rig, rig.home).tensions
     plant = Plant(rig, rig.home, load)
-    plant.settle_counts(plant.counts_for(rig.home, tensions))  # wound for the empty platform
+    plant.settle_counts(counts_for(plant, rig, rig.home, tensions))  # wound for the empty platform
     matrix = structure_matrix(rig, rig.home)
     lengths = cable_lengths(rig, rig.home)
     stiffness = (matrix * rig.cable_stiffness / lengths) @ matrix.T
@@ -164,7 +169,7 @@ def test_a_known_load_lowers_the_platform_by_force_over_stiffness(rig: Rig) -> N
 
 def test_a_cable_paid_out_goes_slack_and_the_rest_carry(rig: Rig) -> None:
     plant = Plant(rig, rig.home)
-    counts = plant.counts_for(rig.home, plant.tensions).copy()
+    counts = counts_for(plant, rig, rig.home, plant.tensions).copy()
     counts[4] += 0.05 * rig.winches[4].counts_per_metre
     plant.settle_counts(counts)
     assert plant.tensions[4] == 0.0
@@ -175,7 +180,7 @@ def test_a_cable_paid_out_goes_slack_and_the_rest_carry(rig: Rig) -> None:
 def test_hanging_on_slack_lower_cables_is_the_lowest_energy(rig: Rig) -> None:
     """All lower cables paid out: the pose is the minimum that another search finds too."""
     plant = Plant(rig, rig.home)
-    counts = plant.counts_for(rig.home, plant.tensions).copy()
+    counts = counts_for(plant, rig, rig.home, plant.tensions).copy()
     counts[4:] += 0.2 * np.array([w.counts_per_metre for w in rig.winches[4:]])
     plant.settle_counts(counts)
     assert (plant.tensions[4:] == 0.0).all()
@@ -196,7 +201,7 @@ def test_the_same_drums_give_the_same_pose(rig: Rig) -> None:
     for _ in range(2):
         plant = Plant(rig, rig.home)
         for shift in (0.0003, 0.0005, -0.0002):
-            counts = plant.counts_for(rig.home, plant.tensions)
+            counts = counts_for(plant, rig, rig.home, plant.tensions)
             plant.settle_counts(counts + shift * 1e5)
         poses.append(plant.pose.matrix())
     assert np.array_equal(*poses)
@@ -205,7 +210,7 @@ def test_the_same_drums_give_the_same_pose(rig: Rig) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -1e9])
 def test_absurd_drum_positions_are_a_fault_that_says_so(rig: Rig, bad: float) -> None:
     plant = Plant(rig, rig.home)
-    counts = plant.counts_for(rig.home, plant.tensions).copy()
+    counts = counts_for(plant, rig, rig.home, plant.tensions).copy()
     counts[0] = bad
     with pytest.raises(Fault, match="simulation failed"):
         plant.settle_counts(counts)
@@ -257,7 +262,7 @@ def test_the_quick_search_and_the_descent_find_the_same_platform(
     robot = pulley_rig if pulleys else rig
     dice = np.random.default_rng(7)
     quick, slow = Plant(robot, robot.home), Plant(robot, robot.home)
-    counts = quick.counts_for(robot.home, quick.tensions)
+    counts = counts_for(quick, robot, robot.home, quick.tensions)
     per_metre = np.array([w.counts_per_metre for w in robot.winches])
     slack = False
     for _ in range(40):
@@ -279,7 +284,7 @@ def test_a_slack_cable_carries_nothing_and_a_taut_one_what_its_stretch_asks(
 ) -> None:
     """Tensions by Hooke's law from lengths that the kinematics gives."""
     plant = Plant(rig, rig.home)
-    counts = plant.counts_for(rig.home, plant.tensions)
+    counts = counts_for(plant, rig, rig.home, plant.tensions)
     counts = counts + np.array(shifts) * [w.counts_per_metre for w in rig.winches]
     plant.settle_counts(counts)
     unstrained = plant.winch_map.unstrained_from_counts(counts)

@@ -92,7 +92,8 @@ def test_the_apriltag_library_gives_the_same_corners(family: str) -> None:
     library, gaps = make_detector("apriltag", family), []
     for _ in range(8):
         picture = printer.image(Condition(side_px=60), rng)
-        found = {d.id: d for d in library.detect(picture.image, exhaustive=True)}
+        standard = library.detect_all(picture.image)
+        found = {d.id: d for d in library.detect_exhaustively(picture.image, standard)}
         gaps.append(found[picture.number].corners - picture.corners)
     assert np.abs(gaps).max() < 0.2
     assert np.abs(np.mean(gaps, axis=(0, 1))).max() < 0.03  # a shift of half a pixel would show

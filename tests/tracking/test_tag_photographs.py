@@ -16,17 +16,18 @@ PHOTOGRAPHS = sorted((Path(__file__).parent / "photographs").glob("*.jpg"))
 FAMILY = "tag36h11"
 
 
-def _found(photograph: Path, *, exhaustive: bool) -> list[Array]:
+def _found(photograph: Path) -> list[Array]:
     image = cv2.imread(str(photograph), cv2.IMREAD_GRAYSCALE)
     assert image is not None
-    found = TagDetector(FAMILY).detect_all(image, exhaustive=exhaustive)
+    detector = TagDetector(FAMILY)
+    found = detector.detect_exhaustively(image, detector.detect_all(image))
     assert {d.id for d in found} == {0}, "a tag that is not on the cubes"
     return [d.corners for d in found]
 
 
 @pytest.mark.parametrize("photograph", PHOTOGRAPHS, ids=lambda path: path.stem)
 def test_an_exhaustive_detection_finds_what_the_apriltag_library_finds(photograph: Path) -> None:
-    found = _found(photograph, exhaustive=True)
+    found = _found(photograph)
     reference = tags_found_by_apriltag(photograph.with_suffix(".txt"))
     missed = [corners for corners in reference if nearest_gap(corners, found) > 2.0]
     assert len(missed) <= 1  # of 12, 25 and 10
@@ -35,6 +36,6 @@ def test_an_exhaustive_detection_finds_what_the_apriltag_library_finds(photograp
 
 @pytest.mark.parametrize("photograph", PHOTOGRAPHS, ids=lambda path: path.stem)
 def test_no_cube_is_seen_twice(photograph: Path) -> None:
-    middles = np.array([corners.mean(axis=0) for corners in _found(photograph, exhaustive=True)])
+    middles = np.array([corners.mean(axis=0) for corners in _found(photograph)])
     gaps = np.linalg.norm(middles[:, None] - middles[None], axis=2) + 1e3 * np.eye(len(middles))
     assert gaps.min() > 8.0

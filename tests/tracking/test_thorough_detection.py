@@ -8,8 +8,8 @@ import pytest
 
 from tests.tracking.hard_images import Condition, HardPrinter
 from tests.tracking.tag_images import FAMILY
-from tracking.camera_model import Region
-from tracking.detection.detector import TagDetector, is_blank
+from tracking.camera_model import Image
+from tracking.detection.detector import Detection, TagDetector, is_blank
 from tracking.detection.tags import CORNER_SIGNS, TagDecoder, carries_tag, official_modules
 
 HARD = {
@@ -30,6 +30,10 @@ def detector() -> TagDetector:
     return TagDetector(FAMILY)
 
 
+def exhaustively(detector: TagDetector, image: Image) -> list[Detection]:
+    return detector.detect_exhaustively(image, detector.detect_all(image))
+
+
 @pytest.mark.parametrize("name", HARD)
 def test_exhaustive_detection_finds_what_standard_detection_misses(
     printer: HardPrinter, detector: TagDetector, name: str
@@ -38,7 +42,7 @@ def test_exhaustive_detection_finds_what_standard_detection_misses(
     for _ in range(6):
         picture = printer.image(HARD[name], rng)
         plain += len(detector.detect(picture.image))
-        found = detector.detect(picture.image, exhaustive=True)
+        found = exhaustively(detector, picture.image)
         assert [d.id for d in found] in ([], [picture.number])
         for d in found:
             exhaustive += 1
@@ -51,14 +55,7 @@ def test_a_tag_found_by_both_searches_is_listed_once(
     printer: HardPrinter, detector: TagDetector
 ) -> None:
     picture = printer.image(Condition(side_px=60), np.random.default_rng(1))
-    assert len(detector.detect_all(picture.image, exhaustive=True)) == 1
-
-
-def test_a_region_is_searched_exhaustively_too(printer: HardPrinter, detector: TagDetector) -> None:
-    picture = printer.image(Condition(side_px=40, contrast=12.0), np.random.default_rng(1))
-    region = Region(40, 20, 280, 220)
-    (found,) = detector.detect(picture.image, region, exhaustive=True)
-    assert np.abs(found.corners - picture.corners).max() < 3.0
+    assert len(exhaustively(detector, picture.image)) == 1
 
 
 def test_no_tag_that_can_be_read_is_in_a_blank_picture(
@@ -80,7 +77,7 @@ def test_no_tag_that_can_be_read_is_in_a_blank_picture(
             blank += 1
             with monkeypatch.context() as context:
                 context.setattr("tracking.detection.detector.is_blank", lambda _image: False)
-                assert detector.detect(picture.image, exhaustive=True) == [], condition
+                assert exhaustively(detector, picture.image) == [], condition
     assert blank > 10
 
 
@@ -101,7 +98,7 @@ def test_squares_with_any_other_pattern_are_no_tags(detector: TagDetector) -> No
     rng = np.random.default_rng(2)
     for _ in range(30):
         pattern = np.pad(rng.random((6, 6)) < 0.5, 1)
-        assert detector.detect(square_picture(pattern), exhaustive=True) == []
+        assert exhaustively(detector, square_picture(pattern)) == []
 
 
 @pytest.mark.parametrize("turns", range(4))

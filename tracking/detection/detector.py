@@ -147,23 +147,12 @@ class TagDetector:
         self._parameters = parameters
         self._detector = cv2.aruco.ArucoDetector(dictionary(family), parameters)
 
-    def detect(
-        self, image: Image, region: Region | None = None, *, exhaustive: bool = False
-    ) -> list[Detection]:
-        """Tags in the image or in a region of it, each number once (the largest).
+    def detect(self, image: Image) -> list[Detection]:
+        """Tags in a grey image, each number once (the largest)."""
+        return list({d.id: d for d in self.detect_all(image)}.values())
 
-        Args:
-            image: Grey image.
-            region: Search region; the whole image when left out.
-            exhaustive: Also find small, faint and blurred tags, in about ten times the time.
-        """
-        largest = {d.id: d for d in self.detect_all(image, region, exhaustive=exhaustive)}
-        return list(largest.values())
-
-    def detect_all(
-        self, image: Image, region: Region | None = None, *, exhaustive: bool = False
-    ) -> list[Detection]:
-        """As `detect`, but with all tags of a number detected more than once, largest last."""
+    def detect_all(self, image: Image, region: Region | None = None) -> list[Detection]:
+        """Tags in the image or in a region of it; those of one number largest last."""
         origin = np.zeros(2)
         if region is not None:
             image = image[region.top : region.bottom, region.left : region.right]
@@ -172,12 +161,13 @@ class TagDetector:
                 return []
         image = np.ascontiguousarray(image)
         found = self._standard(image)
-        if exhaustive:
-            found += self._exhaustive(image, found)
         return _sorted([Detection(d.id, read_only(d.corners + origin)) for d in found])
 
     def detect_exhaustively(self, image: Image, known: Sequence[Detection]) -> list[Detection]:
-        """Extends a standard `detect_all`, which found ``known``, to an exhaustive one."""
+        """Extends `detect_all`, which found ``known``, to small, faint and blurred tags.
+
+        It takes about ten times as long.
+        """
         image = np.ascontiguousarray(image)
         return _sorted([*known, *self._exhaustive(image, known)])
 

@@ -185,6 +185,8 @@ CROWDED = 0.22
 NEAR, FAR = 0.03, 0.3
 #: Maximum number of fits.
 MOST_FITS = 4
+#: A square in every image, which replaces unusable tags, so that arrays keep their shape.
+_DUMMY_SQUARE = np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -240,7 +242,7 @@ def refine(image: Image, camera: Camera, corners: Array, modules: int) -> list[R
     pixels.flags.writeable = False  # kernels are compiled for images that are read-only
     rough = np.array(corners, dtype=np.float64)
     inside = _inside(rough, image.shape)
-    curves = EdgeCurves.between(camera, np.where(inside, rough, _dummy_square(image.shape)))
+    curves = EdgeCurves.between(camera, np.where(inside, rough, _DUMMY_SQUARE))
     found = np.zeros((len(rough), 4, COLUMNS))
     widths = curves.module_widths(modules)
     locate_edges(pixels, curves.pixels, curves.bows, widths, found)
@@ -270,7 +272,7 @@ def load_kernels() -> None:
     """Loads or compiles the machine code of `refine` in advance."""
     grey = np.zeros((16, 16), dtype=np.uint8)
     grey.flags.writeable = False
-    square, bows = _dummy_square(grey.shape)[None], np.zeros((1, 4, 2))
+    square, bows = _DUMMY_SQUARE[None], np.zeros((1, 4, 2))
     widths, found = np.ones((1, 4)), np.zeros((1, 4, COLUMNS))
     locate_edges(grey, square, bows, widths, found)
     fit_edges(grey, square, bows, widths, 8, found, np.zeros_like(found))
@@ -282,11 +284,6 @@ def _inside(corners: Array, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     return np.asarray(
         np.all((corners >= 2.0) & (corners <= limit), axis=(1, 2), keepdims=True), dtype=np.bool_
     )
-
-
-def _dummy_square(shape: tuple[int, ...]) -> Array:
-    """A square in the image that replaces unusable tags, so that arrays keep their shape."""
-    return np.array([[4.0, 4.0], [14.0, 4.0], [14.0, 14.0], [4.0, 14.0]])
 
 
 def _unsettled(moved: Array, found: Array, widths: Array, lines: Lines) -> NDArray[np.bool_]:

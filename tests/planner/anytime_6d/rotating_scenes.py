@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from model.files.documents import PoseDocument
 from model.files.scene_file import SceneDocument
 from model.kinematics import structure_matrix
 from model.pose import Array, Pose, interpolate
-from model.rig import Rig, load_rig, rig_from_document
+from model.rig import Rig, rig_from_document
 from model.scene import Scene, load_scene, scene_from_document
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
@@ -22,11 +21,8 @@ from planner.anytime_6d.path import rotating_problem
 from planner.anytime_6d.problem import RotatingProblem
 from planner.costs import KinematicCost
 from planner.settings import OBJECTIVES, Weights
+from tests.configs import CONFIGS
 from tests.planner.collision.sampled_oracle import CoalScene
-
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 
 
 def turning(name: str, tilt_deg: float, turn_deg: float, **parts: Any) -> Scene:

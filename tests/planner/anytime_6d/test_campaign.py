@@ -10,15 +10,9 @@ from model.pose import Array, Pose, interpolate
 from model.rig import Rig
 from model.scene import Scene, scene_from_document
 from planner.anytime_6d.problem import RotatingProblem, move_allowed, put_between
+from tests.configs import GACHON, HALL
 from tests.effort import cases
-from tests.planner.anytime_6d.rotating_scenes import (
-    GACHON,
-    HALL,
-    Judge,
-    problem_of,
-    random_pose,
-    row,
-)
+from tests.planner.anytime_6d.rotating_scenes import Judge, problem_of, random_pose, row
 from tests.planner.collision.sampled_oracle import random_scene
 
 SCENES, MOVES, SAMPLES = cases(14, 0.3), 30, 9

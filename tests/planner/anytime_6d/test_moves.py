@@ -19,15 +19,8 @@ from planner.anytime_6d.problem import (
     rotation_between,
     rotations_kept,
 )
-from tests.planner.anytime_6d.rotating_scenes import (
-    GACHON,
-    HALL,
-    Judge,
-    problem_of,
-    random_pose,
-    row,
-    turning,
-)
+from tests.configs import GACHON, HALL
+from tests.planner.anytime_6d.rotating_scenes import Judge, problem_of, random_pose, row, turning
 
 seeds = st.integers(0, 2**32 - 1)
 

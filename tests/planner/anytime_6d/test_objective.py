@@ -28,15 +28,8 @@ from planner.check import verify
 from planner.costs import KinematicCost
 from planner.planning import make_plan
 from planner.settings import OBJECTIVES, TurningSettings, Weights
-from tests.planner.anytime_6d.rotating_scenes import (
-    CONFIGS,
-    GACHON,
-    HALL,
-    Judge,
-    problem_of,
-    random_pose,
-    turning,
-)
+from tests.configs import CONFIGS, GACHON, HALL
+from tests.planner.anytime_6d.rotating_scenes import Judge, problem_of, random_pose, turning
 
 RAMP = load_scene(CONFIGS / "turn.yaml")
 WIDE = turning("environment_1", 7.0, 2.0)

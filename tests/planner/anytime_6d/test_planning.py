@@ -18,20 +18,14 @@ from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene, empty_scene, load_scene
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.anytime_6d.path import RotatingRoute, rotating_route
+from planner.anytime_6d.path import rotating_route
 from planner.check import check_path, verify
 from planner.costs import KinematicCost
+from planner.path import Route
 from planner.planning import make_plan
 from planner.settings import TurningSettings
-from tests.planner.anytime_6d.rotating_scenes import (
-    CONFIGS,
-    GACHON,
-    HALL,
-    Judge,
-    quaternion,
-    turning,
-    upside_down,
-)
+from tests.configs import CONFIGS, GACHON, HALL
+from tests.planner.anytime_6d.rotating_scenes import Judge, quaternion, turning, upside_down
 
 ROUNDS = TurningSettings(rounds=60)
 RAMP = load_scene(CONFIGS / "turn.yaml")
@@ -39,7 +33,7 @@ RAMP = load_scene(CONFIGS / "turn.yaml")
 
 def routed(
     scene: Scene, settings: TurningSettings, clock: Callable[[], float] = time.perf_counter
-) -> RotatingRoute:
+) -> Route:
     return rotating_route(
         GACHON, scene, settings, KinematicCost(GACHON, scene.start.rotation), clock=clock
     )
@@ -81,10 +75,10 @@ def test_a_platform_frame_whose_z_axis_points_down_is_planned_like_any_other() -
 
 
 def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> None:
-    first, again = (routed(RAMP, ROUNDS).route for _ in range(2))
+    first, again = (routed(RAMP, ROUNDS) for _ in range(2))
     assert first.path.tolist() == again.path.tolist()
     assert first.edge_checks == again.edge_checks
-    other = routed(RAMP, TurningSettings(seed=1, rounds=60)).route
+    other = routed(RAMP, TurningSettings(seed=1, rounds=60))
     assert other.path.tolist() != first.path.tolist()
 
 
@@ -92,9 +86,9 @@ def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_states_them() -> N
     ticks = itertools.count()
     settings = TurningSettings(budget=0.040)
     found = routed(RAMP, settings, clock=lambda: 1e-3 * next(ticks))
-    again = routed(RAMP, TurningSettings(rounds=found.rounds))
-    assert again.route.path.tolist() == found.route.path.tolist()
-    lengths = [routed(RAMP, TurningSettings(rounds=rounds)).route.path for rounds in (15, 40, 90)]
+    again = routed(RAMP, TurningSettings(rounds=found.iterations))
+    assert again.path.tolist() == found.path.tolist()
+    lengths = [routed(RAMP, TurningSettings(rounds=rounds)).path for rounds in (15, 40, 90)]
     sums = [_length(path) for path in lengths]
     assert sums == sorted(sums, reverse=True)
 
@@ -113,10 +107,10 @@ def test_where_nothing_blocks_it_the_single_move_is_the_path() -> None:
     goal = {"position_mm": [60, 40, 430], "rotation_wxyz": quaternion(4.0, -3.0)}
     scene = turning("environment_1", 8.0, 2.0, goal=goal, obstacles=[])
     route = routed(scene, ROUNDS)
-    assert route.rounds == 1
+    assert route.iterations == 1
     level = make_plan(GACHON, scene.changed(goal=Pose.level([0.06, 0.04, 0.43])), ROUNDS)
     assert "rotation" not in dict(plan_facts(level))
-    assert len(route.route.path) == 2
+    assert len(route.path) == 2
 
 
 def test_a_stop_may_be_tilted_otherwise_than_start_and_goal() -> None:

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from model.pose import Array
-from model.rig import Rig, load_rig
+from model.rig import Rig
+from tests.configs import GACHON
 from tests.planner.collision.sampled_oracle import changed_rig
-
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
 
 ANCHORS = ("on", "inside", "above", "around", "mixed")
 PLATFORMS = ("cube", "thin", "long")

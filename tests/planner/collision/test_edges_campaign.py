@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from model.pose import Array, Pose
-from model.rig import load_rig
-from planner.collision.edges import edge_free, edges_free
+from planner.collision.edges import edge_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import World
+from tests.configs import GACHON
 from tests.effort import cases
 from tests.planner.collision.sampled_oracle import CoalScene, random_scene
 
-GACHON = load_rig(Path(__file__).parents[3] / "configs" / "gachon_8_6.yaml")
 CLEARANCE = 0.01
 SCENES, EDGES, GRAZING = cases(125), 140, 20
 POSES, POSES_GRAZING = 2, 5
@@ -48,7 +45,8 @@ def test_no_accepted_edge_violates_its_clearance_anywhere() -> None:
         starts = rng.uniform(low, high, (EDGES, 3))
         reach = rng.choice([0.02, 0.1, 0.5], (EDGES, 1))
         ends = np.clip(starts + reach * rng.normal(size=(EDGES, 3)), low, high)
-        free = edges_free(world, starts, ends)
+        pairs = zip(starts, ends, strict=True)
+        free = np.array([edge_free(world, *edge) for edge in pairs])
         edges = list(zip(starts[free], ends[free], strict=True))
         blocked = ends[~free]
         looked_at = [(edge, rng.uniform(size=POSES)) for edge in edges]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -12,16 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from model.kinematics import cables_to
 from model.pose import Pose
-from model.rig import Rig, load_rig
+from model.rig import Rig
 from planner.collision.edges import edge_clearance, edge_free
 from planner.collision.rotating_edges import rotated_by, rotating_edge_free
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import exit_point, exit_travel
+from tests.configs import GACHON, HALL
 from tests.planner.collision.sampled_oracle import KINDS, CoalScene, random_scene
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 seeds = st.integers(0, 2**32 - 1)
 
 

@@ -17,11 +17,12 @@ from planner.collision.self_collision_regions import PROVED, REFUTED, compared
 from planner.collision.world import (
     build_robot,
     build_world,
-    self_edges_free,
+    self_edge_free,
     self_rotating_edge_free,
     unproved_robot,
 )
-from tests.planner.collision.random_builds import GACHON, Build, random_build, rig_of
+from tests.configs import GACHON
+from tests.planner.collision.random_builds import Build, random_build, rig_of
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 
 EMPTY = random_scene(np.random.default_rng(0), GACHON, 0)
@@ -100,7 +101,7 @@ def test_rigs_with_anchors_off_the_box_of_their_platform_have_free_edges() -> No
         positions = home + np.linspace(0.0, 1.0, SAMPLES)[:, None] * (end - home)
         level = np.broadcast_to(np.eye(3), (SAMPLES, 3, 3))
         assert model.self_clearances(positions, level).min() > 0.005
-    assert self_edges_free(world, robot, np.tile(home, (3, 1)), ends).all()
+    assert all(self_edge_free(world, robot, home, end) for end in ends)
     turn = np.array([0.0, 0.0, 0.01])
     assert self_rotating_edge_free(world, robot, home, ends[1], np.eye(3), turn)
 
@@ -141,7 +142,8 @@ def test_edges_are_decided_the_same_with_and_without_precomputed_proofs() -> Non
             continue
         clearance = float(np.median(least[least > CLOSE])) - CLOSE
         robot = build_robot(rig, world, clearance)
-        free = self_edges_free(world, robot, starts, ends)
+        edges = zip(starts, ends, strict=True)
+        free = np.array([self_edge_free(world, robot, *edge) for edge in edges])
         assert not free[least < clearance - CLOSE].any()
         assert free[least > clearance + CLOSE].all()
         answers += free.tolist()

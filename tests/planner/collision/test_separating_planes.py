@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -15,11 +13,9 @@ from planner.collision.edges import edge_clearance
 from planner.collision.separating_planes import cable_core, core_of
 from planner.collision.world import build_world
 from planner.kernels.scene_arrays import pieces_of
+from tests.configs import CONFIGS, GACHON
 from tests.planner.collision.sampled_oracle import KINDS, random_scene
 from tests.planner.kernels.definitions import segment_box_definition
-
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
 
 
 @pytest.mark.parametrize("kind", ["box", "rotated box", "sphere", "capsule", "cylinder"])

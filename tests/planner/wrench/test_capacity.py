@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,19 +11,17 @@ from hypothesis import strategies as st
 
 from model.kinematics import structure_matrix
 from model.pose import Array, Pose
-from model.rig import Rig, load_rig
+from model.rig import Rig
 from model.scene import Scene, load_scene
 from planner.collision.world import build_world
 from planner.costs import capacity_margins
 from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import build_load, factored, margins, orthogonal_vector
 from planner.wrench.feasibility_proof import tensions_prove
-from planner.wrench.translation import build_holding, edge_held, edges_held
+from planner.wrench.translation import build_holding, edge_held
+from tests.configs import CONFIGS, GACHON, HALL
 from tests.planner.collision.sampled_oracle import changed_rig
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 PAPER = load_scene(CONFIGS / "environment_1.yaml")
 PILLAR = load_scene(CONFIGS / "hall_pillar.yaml")
 BOTH = pytest.mark.parametrize(("rig", "scene"), [(GACHON, PAPER), (HALL, PILLAR)])
@@ -157,7 +154,8 @@ def test_held_edges_keep_the_reserve_at_every_sample(
     world, load = world_of(rig, scene), build_load(rig, scene, np.eye(3))
     holding = build_holding(world, load, reserve)
     starts, ends = random_edges(np.random.default_rng(2), rig, 80)
-    held = edges_held(world, load, holding, starts, ends)
+    edges = zip(starts, ends, strict=True)
+    held = np.array([edge_held(world, load, holding, *edge) for edge in edges])
     least = smallest_margins(rig, scene, starts, ends)
     assert np.all(least[held] >= reserve - 1e-9)
     # A refused edge is short of the reserve somewhere, or only slightly above it.
@@ -178,8 +176,9 @@ def test_proved_cells_keep_the_reserve_and_change_no_answer() -> None:
     assert capacity_margins(GACHON, PAPER, inside, np.eye(3)).min() >= 4.0
     bare = holding._replace(cells=np.zeros_like(holding.cells), everywhere=False)
     starts, ends = random_edges(rng, GACHON, 60)
-    with_cells = edges_held(world, load, holding, starts, ends)
-    assert with_cells.tolist() == edges_held(world, load, bare, starts, ends).tolist()
+    for edge in zip(starts, ends, strict=True):
+        with_cells = edge_held(world, load, holding, *edge)
+        assert with_cells == edge_held(world, load, bare, *edge)
 
 
 @BOTH

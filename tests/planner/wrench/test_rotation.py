@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from model.kinematics import structure_matrix
 from model.pose import Array, Pose
-from model.rig import Rig, load_rig
+from model.rig import Rig
 from model.scene import Scene, load_scene, scene_from_document
 from model.statics.feasibility import WrenchBox, capacity_margin
 from model.statics.gravity import weight_wrench
@@ -23,11 +22,9 @@ from planner.kernels.scene_arrays import World
 from planner.wrench.capacity import LoadArrays, build_load, load_at, margin_at
 from planner.wrench.rotation import column_motion, rotating_edge_held
 from planner.wrench.translation import build_holding, edge_held
+from tests.configs import CONFIGS, GACHON, HALL
 from tests.planner.collision.sampled_oracle import changed_rig
 
-CONFIGS = Path(__file__).parents[3] / "configs"
-GACHON = load_rig(CONFIGS / "gachon_8_6.yaml")
-HALL = load_rig(CONFIGS / "hall_10_6.yaml")
 PAPER = load_scene(CONFIGS / "environment_1.yaml")
 PILLAR = load_scene(CONFIGS / "hall_pillar.yaml")
 BOTH = pytest.mark.parametrize(("rig", "scene"), [(GACHON, PAPER), (HALL, PILLAR)])

@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 import numpy as np
 
-from drivers.cia402.pdo import EMCY_BASE, RPDO1_BASE, parse_emergency, parse_set_point
+from drivers.cia402.pdo import EMCY_BASE, RPDO1_BASE, parse_emergency
 from drivers.cia402.state_machine import TORQUE_ON, DriveState
 from executor.trajectory.setpoints import PreparedRun
 from model.pose import Array, Pose
@@ -21,6 +21,7 @@ from model.scene import Load
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.cia402 import Frame
 from simulation.drives.cia402_rig import SimulatedCia402Rig
+from tests.drivers.drive_bench import parse_set_point
 
 ENABLED = DriveState.OPERATION_ENABLED
 DISABLE_VOLTAGE, FAULT_RESET = 0x02, 0x80
