@@ -135,12 +135,13 @@ class Visit:
         for _ in range(5):
             before = _count(self.fake.ask(), command)
             notice.evaluate("(notice) => (notice.textContent = '')")
-            for button in map(self.page.locator, buttons):
-                expect(button.or_(refused).first).to_be_attached()
-                if refused.count():
-                    break
-                with contextlib.suppress(TimeoutError):  # a question that was withdrawn
-                    button.click(timeout=1000.0 * PATIENCE_S / 5.0)
+            try:
+                for button in map(self.page.locator, buttons):
+                    expect(button.or_(refused).first).to_be_attached()
+                    if not refused.count():
+                        button.click(timeout=1000.0 * PATIENCE_S / 5.0)
+            except TimeoutError:  # of a question that was withdrawn
+                continue
             found = self.fake.wait(
                 self.page,
                 lambda f, n=before: _count(f, command) > n or refused.count() > 0,  # type: ignore[misc]
@@ -171,17 +172,20 @@ class Visit:
             expect(self.page.locator("#poses li").last.locator("input")).to_have_value(name)
 
     def pick(self) -> None:
-        """Clicks in the middle of the scene until a goal is picked.
+        """Clicks about the middle of the scene until a goal in the workspace is picked.
 
         A click before the first frame is drawn picks nothing, nor does one while data are stale.
         """
-        bar = self.page.locator("#pick-bar")
-        for _ in range(100):
+        bar, canvas = self.page.locator("#pick-bar"), self.page.locator("#scene-canvas")
+        for k in range(100):
             if not bar.is_visible():
                 self.page.locator("#pick").click()
-            self.page.locator("#scene-canvas").click()
+            box = canvas.bounding_box()
+            assert box
+            share = (0.45, 0.5, 0.4, 0.55, 0.35)[k % 5]  # the middle may be outside at some heights
+            canvas.click(position={"x": 0.5 * box["width"], "y": share * box["height"]})
             self.fake.let_pass(self.page, 2)
-            if " mm" in self.page.locator("#pick-text").inner_text():
+            if self.page.locator("#pick-text").inner_text().endswith(" mm"):
                 return
         raise AssertionError("nothing is picked in the scene")
 
