@@ -128,7 +128,7 @@ def settings_of_legs(settings: Settings, rounds: Sequence[int], count: int) -> S
         return [settings] * count
     if count > 1 and settings.longest < np.inf:
         raise BadInput(
-            "a scene with stops cannot have a limit on the path length",
+            "a path with stops (`via=` or the scene's) cannot have a limit on its length",
             why="each leg is planned on its own, without knowing the others' lengths",
             next_step="leave out `longest=`, or plan from stop to stop",
         )

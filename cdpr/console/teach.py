@@ -15,7 +15,7 @@ from model.errors import BadInput, InvalidFile, Refused
 from model.files.documents import Document, Name, PoseDocument, millimetres, write_atomic
 from model.files.reading import parse_json, read_text
 from model.files.scene_file import RotationLimitsDocument, SceneDocument, StopDocument
-from model.files.validation import problems_of
+from model.files.validation import problems_of, sentence_of
 from model.pose import Pose, largest_rotations
 from model.rig import Rig
 from model.scene import Scene
@@ -247,8 +247,11 @@ def scene_text(document: SceneDocument) -> str:
 def _named(pose: PoseDocument, name: str) -> TaughtPose:
     try:
         checked = TypeAdapter(Name).validate_python(name.strip())
-    except ValidationError:
-        raise _refusal(f"'{name}' is not a valid name", "use 1 to 80 letters or digits") from None
+    except ValidationError as error:
+        reason = sentence_of(error.errors()[0], TaughtPose)
+        raise _refusal(
+            f"'{name}' is not a valid name: it {reason}", "choose another name"
+        ) from None
     given = {"position_mm": pose.position_mm, "rotation_wxyz": pose.rotation_wxyz}
     return TaughtPose(name=checked, **given)
 

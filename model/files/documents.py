@@ -70,10 +70,8 @@ def _not_too_small(value: float) -> float:
 def _is_name(text: str) -> str:
     if not text.isprintable():
         raise ValueError(f"must be a name on one line; it is {text[:60]!r}")
-    if len(text.encode()) > NAME_BYTES:
-        raise ValueError(
-            f"must be a name of {NAME_BYTES} bytes at most; it has {len(text)} characters"
-        )
+    if (size := len(text.encode())) > NAME_BYTES:
+        raise ValueError(f"must have {NAME_BYTES} bytes at most; it has {size}")
     return text
 
 

@@ -38,6 +38,10 @@ SCENE = CONFIGS / "environment_1.yaml"
         (["--weight", "length=-1"], ["length", "0 or more"]),
         (["--weight", "length=nan"], ["length", "0 or more"]),
         (["--weight", "clearance=1"], ["path length is unbounded", "length"]),
+        (
+            ["--via-mm", "0", "0", "450", "--longest-mm", "3000"],
+            ["stops (--via-mm or", "out --lon"],
+        ),
     ],
 )
 def test_options_that_cannot_be_heeded_are_one_clear_message(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -18,7 +19,15 @@ from weakref import WeakKeyDictionary
 import cv2
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, ConsoleMessage, FloatRect, Page, expect, sync_playwright
+from playwright.sync_api import (
+    Browser,
+    ConsoleMessage,
+    FloatRect,
+    Page,
+    TimeoutError,
+    expect,
+    sync_playwright,
+)
 
 ROOT = Path(__file__).parents[2]
 ARGUMENTS = [
@@ -107,55 +116,101 @@ class Visit:
         if tab.is_visible():
             tab.click()
 
+    def blink(self) -> None:
+        """The data are stale for a moment."""
+        self.fake.ask(silent=True)
+        expect(self.page.locator("#stale")).to_be_visible()
+        self.fake.let_pass(self.page, 2)
+        self.fake.ask(silent=False)
+        expect(self.page.locator("#stale")).to_be_hidden()
+
+    def send(self, command: str, *buttons: str) -> None:
+        """Clicks buttons in turn, until the server has received the command.
+
+        On a busy computer data can be stale for a moment. What is clicked then is not done, as the
+        page's notice says: it begins again with the first button.
+        """
+        notice = self.page.locator("#notice")
+        refused = self.page.locator("#notice", has_text=re.compile(r"\S"))
+        for _ in range(5):
+            before = _count(self.fake.ask(), command)
+            notice.evaluate("(notice) => (notice.textContent = '')")
+            try:
+                for button in map(self.page.locator, buttons):
+                    expect(button.or_(refused).first).to_be_attached()
+                    if not refused.count():
+                        button.click(timeout=1000.0 * PATIENCE_S / 5.0)
+            except TimeoutError:  # of a question that was withdrawn
+                continue
+            found = self.fake.wait(
+                self.page,
+                lambda f, n=before: _count(f, command) > n or refused.count() > 0,  # type: ignore[misc]
+            )
+            if _count(found, command) > before:
+                return
+        raise AssertionError(f"{command} is not sent: {notice.text_content()}")
+
+    def choose(self, group: str, value: str) -> None:
+        """Selects a radio button, by its label."""
+        choice = self.page.locator(f"input[name={group}][value='{value}']")
+        for _ in range(5):
+            self.page.locator("label", has=choice).click()
+            if choice.is_checked():
+                return
+        raise AssertionError(f"{value} cannot be selected")
+
     def take_control(self) -> None:
         self.view("operate")
-        self.page.locator("#take-control").click()
+        self.send("take_control", "#take-control")
         expect(self.page.locator("#lamp-control")).to_have_text("You have control")
 
     def taught(self, *names: str) -> None:
         """The current pose is stored under each name."""
         for name in names:
             self.page.locator("#teach-name").fill(name)
-            self.page.locator("#teach").click()
+            self.send("teach", "#teach")
             expect(self.page.locator("#poses li").last.locator("input")).to_have_value(name)
 
     def pick(self) -> None:
-        """Clicks in the middle of the scene until a goal is picked.
+        """Clicks about the middle of the scene until a goal in the workspace is picked.
 
-        A click before the first frame is drawn picks nothing.
+        A click before the first frame is drawn picks nothing, nor does one while data are stale.
         """
-        for _ in range(100):
-            self.page.locator("#scene-canvas").click()
-            self.page.wait_for_timeout(100)
-            if " mm" in self.page.locator("#pick-text").inner_text():
+        bar, canvas = self.page.locator("#pick-bar"), self.page.locator("#scene-canvas")
+        for k in range(100):
+            if not bar.is_visible():
+                self.page.locator("#pick").click()
+            box = canvas.bounding_box()
+            assert box
+            share = (0.45, 0.5, 0.4, 0.55, 0.35)[k % 5]  # the middle may be outside at some heights
+            canvas.click(position={"x": 0.5 * box["width"], "y": share * box["height"]})
+            self.fake.let_pass(self.page, 2)
+            if self.page.locator("#pick-text").inner_text().endswith(" mm"):
                 return
         raise AssertionError("nothing is picked in the scene")
 
     def load(self, name: str = "plans/circle.json") -> None:
         self.view("operate")
-        self.page.locator(f"input[name=plan-file][value='{name}']").check(force=True)
-        self.page.locator("#load-plan").click()
+        self.choose("plan-file", name)
+        self.send("load_plan", "#load-plan")
         expect(self.page.locator("#plan-name")).to_have_text(name)
 
     def run(self) -> None:
-        self.page.locator("#run").click()
-        self.page.locator(".confirm").click()
+        self.send("run", "#run", ".confirm")
         expect(self.page.locator("#motion-state")).to_contain_text("Moving")
 
     def ready_to_jog(self) -> None:
         self.take_control()
         self.view("jog")
-        self.page.locator("#jog-begin").click()
+        self.send("jog_begin", "#jog-begin")
         expect(self.page.locator("#jog-state")).to_contain_text("Ready")
 
     def ready_to_jog_cables(self) -> None:
         self.take_control()
         self.view("service")
-        self.page.locator("#service-begin").click()
-        self.page.locator(".confirm").click()
+        self.send("service_begin", "#service-begin", ".confirm")
         expect(self.page.locator("#lamp-control")).to_have_text("Service mode")
-        self.page.locator("#cable-begin").click()
-        self.page.locator(".confirm").click()
+        self.send("cable_begin", "#cable-begin", ".confirm")
         expect(self.page.locator("#cable-state")).to_contain_text("Ready")
 
     def hold(self, name: str = "+x") -> int:
@@ -182,7 +237,8 @@ class Visit:
 
 
 def _count(found: dict[str, Any], kind: str) -> int:
-    return sum(m["kind"] == kind for m in found["received"])
+    """Messages of a kind, or commands of a name."""
+    return sum(kind in (m["kind"], m.get("command")) for m in found["received"])
 
 
 COLOUR = "role => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`)"

@@ -139,6 +139,7 @@ class Fake:
         self.homed = True
         self.plan: str | None = None
         self.compared: str | None = None
+        self.refusal = ""  # of every command of the page in control
         self.poses: list[dict[str, Any]] = []
         self.outcome: dict[str, Any] | None = None
         self.share = self.rate = 0.0
@@ -429,7 +430,7 @@ class Fake:
             if self.in_control not in (None, page) and not message.get("force"):
                 return False, "another page has control"
             self.in_control = page
-            return True, "You have control."
+            return True, ""
         if page is not self.in_control:
             return False, "Take control first."
         return self._obey(message)
@@ -444,6 +445,8 @@ class Fake:
 
     def _obey(self, message: dict[str, Any]) -> tuple[bool, str]:
         command, pose = message["command"], message.get("pose")
+        if self.refusal:
+            return False, self.refusal
         if command == "give_control":
             self.in_control, self.service = None, False
         elif command in ("service_begin", "service_end"):
@@ -496,7 +499,7 @@ class Fake:
             self.poses = [*rest[: message["to"]], *moved, *rest[message["to"] :]]
         else:
             return False, f"no such command: {command}"
-        return True, f"{command.replace('_', ' ')}: done"
+        return True, ""
 
 
 def application(fake: Fake) -> FastAPI:

@@ -78,6 +78,33 @@ def test_in_a_text_field_a_space_is_a_space(desk: Visit) -> None:
     assert desk.fake.let_pass(desk.page)["stops"] == 0
 
 
+def test_a_text_field_has_the_focus_again_after_stale_data(desk: Visit) -> None:
+    """Else the next space of a name would stop a run."""
+    desk.take_control()
+    desk.load()
+    desk.run()
+    desk.view("teach")
+    field = desk.page.locator("#teach-name")
+    field.press_sequentially("left")
+    desk.blink()
+    desk.page.keyboard.type(" side")
+    expect(field).to_have_value("left side")
+    assert desk.fake.let_pass(desk.page)["stops"] == 0
+
+
+def test_a_space_on_a_stale_page_stops_where_a_text_field_had_the_focus(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    field = desk.page.locator("#teach-name")
+    field.press_sequentially("left")
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale")).to_be_visible()
+    expect(field).not_to_be_focused()
+    desk.page.keyboard.press(" ")
+    desk.fake.wait(desk.page, lambda f: bool(f["stops"] >= 1))
+    expect(field).to_have_value("left")
+
+
 def test_stop_works_on_a_stale_page(desk: Visit) -> None:
     desk.fake.ask(silent=True)
     expect(desk.page.locator("#stale-text")).to_have_text(STALE)

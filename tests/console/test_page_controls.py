@@ -219,6 +219,27 @@ def test_every_button_is_in_the_table_and_says_why_it_is_not_possible(desk: Visi
     assert desk.fake.received("hold") == []
 
 
+def test_a_press_that_ends_while_data_are_stale_is_not_lost_silently(desk: Visit) -> None:
+    """The browser sends no click then."""
+    desk.take_control()
+    desk.view("teach")
+    box, mouse = desk.page.locator("#teach").bounding_box(), desk.page.mouse
+    assert box
+    mouse.move(box["x"] + 20, box["y"] + 10)
+    mouse.down()
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale")).to_be_visible()
+    mouse.up()
+    desk.fake.ask(silent=False)
+    notice = desk.page.locator("#notice")
+    expect(notice).to_contain_text("Teach this pose: not done. No data from the console’s server")
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("teach") == []
+    desk.send("teach", "#teach")
+    expect(desk.page.locator("#notice-box")).to_be_hidden()
+
+
 # For everybody.
 
 
@@ -375,56 +396,50 @@ def test_the_server_understands_every_message_of_the_page(desk: Visit) -> None:
     page = desk.page
     desk.take_control()
     desk.load()
-    page.locator("#compare-plan").click()
-    page.locator("#compare-end").click()
+    desk.send("compare", "#compare-plan")
+    desk.send("compare", "#compare-end")
     desk.run()
     page.locator("#speed").fill("50")
-    page.locator("#hold").click()
-    page.locator("#resume").click()
+    desk.send("hold", "#hold")
+    desk.send("resume", "#resume")
     page.keyboard.press(" ")
     expect(page.locator("#outcome")).to_be_visible()
     for name in ("home", "release"):
-        page.locator(f"#{name}").click()
-        page.locator(".confirm").click()
+        desk.send(name, f"#{name}", ".confirm")
     desk.fake.ask(set={"latched": "slack", "homed": True}, state={"simulated": False})
-    page.locator("#read-drives").click()
-    page.locator("#reset").click()
-    page.locator(".confirm").click()
+    desk.send("read_drives", "#read-drives")
+    desk.send("reset", "#reset", ".confirm")
     page.locator("summary", has_text="Make a plan").click()
-    page.locator("input[name=scene-file]").first.check(force=True)
-    page.locator("#make-plan").click()
+    desk.choose("scene-file", desk.fake.ask()["files"]["scenes"][0])
+    desk.send("plan", "#make-plan")
     expect(page.locator("#outcome-show")).to_be_visible()
     desk.view("teach")
-    for taught in range(1, 3):
-        page.locator("#teach").click()
-        expect(page.locator("#notice")).to_have_text("teach: done")
-        expect(page.locator("#poses li")).to_have_count(taught)  # the next name follows from these
-    page.locator("#pick").click()
+    for _ in range(2):
+        desk.send("teach", "#teach")
+    expect(page.locator("#poses li")).to_have_count(2)
     desk.pick()
-    page.locator("#pick-keep").click()
+    desk.send("teach_at", "#pick-keep")
     expect(page.locator("#poses li")).to_have_count(3)
-    page.get_by_role("button", name="Move pose 2 up").click()
+    desk.send("move", "[aria-label='Move pose 2 up']")
     expect(page.locator("#poses li").first.locator("input")).to_have_value("pose 2")
     page.get_by_role("textbox", name="Name of pose 1").fill("grip")
     page.get_by_role("textbox", name="Name of pose 1").press("Enter")
-    page.locator("#plan-poses").click()
-    expect(page.locator("#outcome-show")).to_be_visible()
-    page.get_by_role("button", name="Plan a path to grip").click()
-    expect(page.locator("#outcome-show")).to_be_hidden()
-    expect(page.locator("#outcome-show")).to_be_visible()
-    page.get_by_role("button", name="Remove pose 1").click()
-    page.locator(".confirm").click()
+    desk.send("plan", "#plan-poses")
+    desk.fake.wait(page, lambda found: found["plan"] is not None)
+    desk.send("plan", "[aria-label='Plan a path to grip']")
+    desk.fake.wait(page, lambda found: found["plan"] is not None)
+    desk.send("forget", "[aria-label='Remove pose 1']", ".confirm")
     expect(page.locator("#poses li")).to_have_count(2)
     desk.view("jog")
-    page.locator("#jog-begin").click()
+    desk.send("jog_begin", "#jog-begin")
     expect(page.locator("#jog-state")).to_contain_text("Ready")
     for step in ("0.1", "1", "10", "null"):
-        page.locator(f"input[name=jog-step][value='{step}']").check(force=True)
+        desk.choose("jog-step", step)
         desk.hold()
         page.mouse.up()
-    page.locator("#jog-end").click()
+    desk.send("jog_end", "#jog-end")
     desk.view("operate")
-    page.locator("#give-control").click()
+    desk.send("give_control", "#give-control")
     expect(page.locator("#lamp-control")).to_have_text("Control is free")
     said = desk.fake.ask()["received"]
     names = {m.get("command", m["kind"]) for m in said}

@@ -96,6 +96,17 @@ def end_one_after_another(desk: Visit, button: str) -> None:
             desk.page.mouse.up(button=mouse)
 
 
+def test_a_pad_does_not_have_the_focus_again_after_stale_data(desk: Visit) -> None:
+    """A key that is still held does not reach it."""
+    desk.ready_to_jog()
+    desk.page.locator("#jog-pad").focus()
+    desk.blink()
+    desk.page.keyboard.down("ArrowRight")
+    desk.fake.let_pass(desk.page)
+    desk.page.keyboard.up("ArrowRight")
+    assert desk.fake.received("held") == []
+
+
 def test_a_held_jog_ends_for_good(desk: Visit) -> None:
     desk.ready_to_jog()
     end_one_after_another(desk, "+x")

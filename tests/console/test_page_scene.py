@@ -210,6 +210,30 @@ def test_on_a_phone_the_scene_comes_up_to_pick_and_the_list_afterwards(phone: Vi
     expect(phone.page.locator("#poses li")).to_have_count(1)
 
 
+def test_picking_goes_on_after_stale_data(desk: Visit) -> None:
+    begin_to_pick(desk)
+    desk.pick()
+    goal = desk.page.locator("#pick-text").inner_text()
+    desk.fake.ask(set={"behind_ms": 700.0})
+    expect(desk.page.locator("#stale")).to_be_visible()
+    desk.fake.let_pass(desk.page)
+    desk.fake.ask(set={"behind_ms": 0.0})
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    desk.fake.let_pass(desk.page)
+    expect(desk.page.locator("#pick-text")).to_have_text(goal)
+    desk.send("teach_at", "#pick-keep")
+    expect(desk.page.locator("#poses li")).to_have_count(1)
+    expect(desk.page.locator("#pick-bar")).to_be_hidden()
+
+
+def test_a_goal_is_kept_once_however_often_it_is_confirmed(desk: Visit) -> None:
+    begin_to_pick(desk)
+    desk.pick()
+    desk.page.locator("#pick-keep").evaluate("(keep) => [1, 2].forEach(() => keep.click())")
+    expect(desk.page.locator("#pick-bar")).to_be_hidden()
+    assert [pose["name"] for pose in desk.fake.ask()["poses"]] == ["goal 1"]
+
+
 def test_picking_ends_with_control(desk: Visit) -> None:
     begin_to_pick(desk)
     desk.fake.ask(state={"control": {"yours": False, "held_by": "page 7"}})

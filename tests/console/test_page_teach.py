@@ -75,6 +75,70 @@ def test_without_a_selected_file_its_buttons_are_inactive_and_say_why(desk: Visi
             expect(active).not_to_have_attribute("aria-disabled", "true")
 
 
+# Names.
+
+
+def test_quick_presses_store_poses_with_different_names(desk: Visit) -> None:
+    """The next press does not wait until the list shows the pose of the last one."""
+    desk.take_control()
+    desk.view("teach")
+    desk.page.locator("#teach").evaluate("(teach) => [1, 2, 3].forEach(() => teach.click())")
+    found = desk.fake.wait(desk.page, lambda f: len(f["poses"]) == 3)
+    assert [pose["name"] for pose in found["poses"]] == ["pose 1", "pose 2", "pose 3"]
+
+
+def test_a_name_typed_before_the_last_answer_stays(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    field = desk.page.locator("#teach-name")
+    field.fill("left")
+    desk.page.evaluate(
+        """() => {
+          document.getElementById("teach").click();
+          document.getElementById("teach-name").value = "right";
+        }"""
+    )
+    expect(desk.page.locator("#poses li input")).to_have_value("left")
+    desk.fake.let_pass(desk.page)
+    expect(field).to_have_value("right")
+    desk.send("teach", "#teach")
+    expect(field).to_have_value("")
+
+
+def test_a_refusal_is_shown_until_a_command_succeeds(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    desk.fake.ask(set={"refusal": "this name is taken"})
+    desk.page.locator("#teach").click()
+    expect(desk.page.locator("#notice")).to_have_text("this name is taken")
+    desk.fake.ask(set={"refusal": ""})
+    desk.fake.let_pass(desk.page)
+    expect(desk.page.locator("#notice-box")).to_be_visible()
+    desk.page.locator("#teach").click()
+    expect(desk.page.locator("#poses li")).to_have_count(1)
+    expect(desk.page.locator("#notice-box")).to_be_hidden(timeout=1000)
+
+
+def test_a_pose_is_renamed_once_its_name_is_complete(desk: Visit) -> None:
+    """Not to a part of it, where stale data take the focus meanwhile."""
+    desk.fake.ask(set={"poses": [POSE]})
+    desk.take_control()
+    desk.view("teach")
+    field = desk.page.get_by_role("textbox", name="Name of pose 1")
+    field.press("End")
+    desk.page.keyboard.type(" half")
+    desk.blink()
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("rename") == []
+    expect(field).to_be_focused()
+    desk.page.keyboard.type(" full")
+    desk.blink()
+    desk.page.keyboard.press("Enter")
+    desk.fake.wait(desk.page, lambda f: [p["name"] for p in f["poses"]] == ["one half full"])
+    assert len(desk.fake.received("rename")) == 1
+    assert desk.fake.ask()["stops"] == 0
+
+
 # Paths.
 
 

@@ -145,9 +145,20 @@ def test_one_pose_is_no_path(tmp_path: Path) -> None:
         taught.scene(empty_scene(load_rig(RIG)), "taught")
 
 
-@pytest.mark.parametrize("name", ["", "a\nb", "\0", " "])
-def test_a_name_that_is_none_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(BadInput, match="name"):
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("", "must not be empty"),
+        (" ", "must not be empty"),
+        ("a\nb", "one line"),
+        ("\0", "one line"),
+        ("ü" * 55, "100 bytes at most; it has 110"),
+    ],
+)
+def test_a_name_that_is_none_is_refused_with_the_reason(
+    tmp_path: Path, name: str, reason: str
+) -> None:
+    with pytest.raises(BadInput, match=reason):
         TaughtPoses(tmp_path / "poses.json").teach(name, pose(1))
 
 

@@ -200,7 +200,7 @@ def test_a_path_past_its_stop_fails_the_check(gachon, scene_with) -> None:
 
 def test_a_longest_path_and_wrong_rounds_are_refused_with_stops(gachon, scene_with) -> None:
     scene = scene_with(stops=[stop("a", 0, 0, 450)])
-    with pytest.raises(BadInput, match="limit on the path length"):
+    with pytest.raises(BadInput, match="limit on its length"):
         make_plan(gachon, scene, OptimalSettings(longest=1.0))
     with pytest.raises(BadInput, match=r"rounds are given for 3 legs; the scene has 2"):
         make_plan(gachon, scene, OptimalSettings(), rounds=[1, 1, 1])

@@ -128,13 +128,24 @@ export function applyButtons(root, situation) {
   showReasons(root, situation, reasons);
 }
 
-/** A press of a disabled button only shows the reason, by `say(text)`. */
+/** A press of a disabled button, or one that ends while data are stale, only shows the reason, by `say(text, failed)`. */
 export function guardButtons(root, say) {
+  const nameOf = (button) => button.dataset.name ?? button.textContent.trim();
+  let pressed = null; // by the pointer that is down
   root.addEventListener("click", (event) => {
     const button = event.target instanceof Element && event.target.closest("button[aria-disabled=true]");
     if (!button) return;
     event.preventDefault();
     event.stopImmediatePropagation();
-    say(`${button.dataset.name ?? button.textContent.trim()}: ${button.getAttribute("aria-description")}.`);
+    say(`${nameOf(button)}: ${button.getAttribute("aria-description")}.`);
+  }, { capture: true });
+  window.addEventListener("pointerdown", ({ target, button, isPrimary }) => {
+    if (isPrimary) pressed = button === 0 && target instanceof Element ? target.closest("button[data-button]:not([data-jog])") : null;
+  }, { capture: true });
+  window.addEventListener("pointerup", ({ isPrimary }) => {
+    if (!isPrimary) return;
+    // No click follows on a button that has become inert.
+    if (pressed?.closest("[inert]") && pressed.getAttribute("aria-disabled")) say(`${nameOf(pressed)}: not done. ${pressed.getAttribute("aria-description")}.`, true);
+    pressed = null;
   }, { capture: true });
 }

@@ -73,9 +73,3 @@ export function link(address, text) {
   if (typeof address !== "string" || !address.startsWith("/") || address.startsWith("//")) return null;
   return make("a", { href: address, target: "_blank", rel: "noopener" }, text);
 }
-
-/** The first of "pose 1", "pose 2" … that is not in use. */
-export function freeName(kind, poses) {
-  const taken = poses.map(({ name }) => name);
-  return taken.concat("").map((_, k) => `${kind} ${k + 1}`).find((name) => !taken.includes(name));
-}

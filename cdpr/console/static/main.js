@@ -21,7 +21,7 @@ const connection = new Connection();
 const scene = new Scene();
 const form = () => ({ plan_file: chosen("plan-file"), scene_file: chosen("scene-file"), from_here: at("plan-from-here").checked });
 const situation = () => ({ state: connection.state, stale: connection.freshness().why, preview: operate.plan, form: form() });
-let noticed = 0;
+let noticed = 0; // timer of the last notice
 
 /** Shows a text below the panels for a while: the server's answer, or why a command was not executed. */
 function say(text, failed = false) {
@@ -34,8 +34,9 @@ function say(text, failed = false) {
 at("notice-seen").addEventListener("click", () => (at("notice-box").hidden = true));
 
 async function command(name, fields) {
-  const answer = await connection.command(name, fields);
+  const earlier = noticed, answer = await connection.command(name, fields);
   if (answer.what || !answer.ok) say(answer.what || `“${name}” was refused.`, !answer.ok);
+  else if (noticed === earlier) at("notice-box").hidden = true; // about what was before
   return answer;
 }
 
@@ -92,6 +93,8 @@ function showTitle() {
   if (state) write(document.querySelector("title"), `${connection.freshness().why ? "No current data" : motionText(state)} – ${state.rig}`);
 }
 
+let focusedBefore = null; // when data became stale
+
 function showAge() {
   const { why, age } = connection.freshness();
   showTitle();
@@ -106,8 +109,18 @@ function showAge() {
   // Stale controls cannot be used, not even by keyboard; an open question is withdrawn.
   if (why) checkDialog();
   at("notice-box").inert = why !== null;
+  if (why && !at("main").inert) focusedBefore = focusedControl();
   if (at("dialog").hidden) at("main").inert = at("tabs").inert = why !== null;
   applyButtons(document.body, situation());
+  if (why) return;
+  if (document.activeElement === document.body) focusedBefore?.focus({ preventScroll: true });
+  focusedBefore = null;
+}
+
+/** The control that is to get the focus back; none of a jog pad, whose keys move the robot. */
+function focusedControl() {
+  const { activeElement: focused } = document;
+  return focused?.closest("main, #tabs") && !focused.closest("#jog-pad, #cable-pad") ? focused : null;
 }
 
 let waiting = false;
@@ -134,7 +147,7 @@ connection.addEventListener("state", () => {
     operate.show(state);
     news.show(state);
     teach.show(state);
-    pick.show();
+    pick.show(state);
     jog.show(state);
     stopBar.show(state.motion);
     checkDialog();

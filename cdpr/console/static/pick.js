@@ -1,13 +1,14 @@
 /* Picking a goal in the scene: a click on a plane at a chosen height gives a position, kept among the taught poses. */
 
-import { whyNot } from "./buttons.js";
-import { at, freeName, known, write } from "./elements.js";
+import { at, known, write } from "./elements.js";
+import { storePose } from "./teach.js";
 
 const MOVED_PX = 6; // a pointer that went farther turned the view
 
 export class Pick {
   #page;
   #point = null;
+  #sent = null; // the point that is being stored
   #down = null;
 
   /** `page` has `command(name, fields)`, `situation()`, `say(text)`, `scene`, `view(name)`, and `showScene()`. */
@@ -16,7 +17,7 @@ export class Pick {
     at("pick").addEventListener("click", () => this.#begin());
     at("pick-cancel").addEventListener("click", () => this.end());
     at("pick-height").addEventListener("input", () => {
-      if (this.#point) this.#point[2] = this.#height;
+      if (this.#point) this.#point = [...this.#point.slice(0, 2), this.#height];
       this.#show();
     });
     at("pick-keep").addEventListener("click", () => this.#keep());
@@ -64,11 +65,14 @@ export class Pick {
   }
 
   async #keep() {
-    if (!this.#point) return this.#page.say("Click in the scene first.");
+    const point = this.#point;
+    if (!point) return this.#page.say("Click in the scene first.");
     if (!this.#isInside) return this.#page.say("The platform may not go there: click on the grid.", true);
-    const name = freeName("goal", this.#page.situation().state.poses);
-    const { ok } = await this.#page.command("teach_at", { name, position_mm: this.#point });
-    if (!ok) return;
+    if (point === this.#sent) return; // pressed twice
+    this.#sent = point;
+    const isStored = await storePose(this.#page, "teach_at", "goal", { position_mm: point });
+    if (this.#sent === point) this.#sent = null;
+    if (!isStored || this.#point !== point) return; // another one was picked meanwhile
     this.end();
     this.#page.view("teach");
   }
@@ -81,8 +85,8 @@ export class Pick {
     this.#page.scene.showPick({ height: this.#height, point });
   }
 
-  /** Where control is lost, picking ends. */
-  show() {
-    if (this.on && whyNot("teach_at", this.#page.situation())) this.end();
+  /** Where control is lost, picking ends; stale data do not end it. */
+  show({ control }) {
+    if (this.on && !control.yours) this.end();
   }
 }

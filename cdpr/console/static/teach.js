@@ -2,7 +2,26 @@
 
 import { whyNot } from "./buttons.js";
 import { ask } from "./dialog.js";
-import { at, chosen, freeName, known, make, mark, write } from "./elements.js";
+import { at, chosen, known, make, mark, write } from "./elements.js";
+
+const sent = new Set(); // names that no state lists yet
+
+/**
+ * Sends `command`, which stores a pose, with a name: the given one, or else the first of "pose 1", "pose 2" … that is not
+ * in use, for the kind "pose". Resolves to whether it was stored.
+ */
+export async function storePose(page, command, kind, fields) {
+  const name = fields.name || freeName(kind, page.situation().state.poses);
+  sent.add(name);
+  const { ok } = await page.command(command, { ...fields, name });
+  if (!ok) sent.delete(name);
+  return ok;
+}
+
+function freeName(kind, poses) {
+  const taken = [...poses.map(({ name }) => name), ...sent];
+  return taken.concat("").map((_, k) => `${kind} ${k + 1}`).find((name) => !taken.includes(name));
+}
 
 export class Teach {
   #page;
@@ -16,9 +35,9 @@ export class Teach {
       at("teach").click();
     });
     at("teach").addEventListener("click", async () => {
-      const name = at("teach-name").value.trim() || freeName("pose", JSON.parse(this.#shown || "[]"));
-      const { ok } = await page.command("teach", { name });
-      if (ok) at("teach-name").value = "";
+      const field = at("teach-name"), typed = field.value;
+      const isStored = await storePose(page, "teach", "pose", { name: typed.trim() });
+      if (isStored && field.value === typed) field.value = ""; // else it holds the name of the next pose
     });
     at("plan-poses").addEventListener("click", () => this.#plan({ from_here: at("plan-from-here").checked }));
     at("teach-jog-end").addEventListener("click", () => page.command("jog_end"));
@@ -36,6 +55,7 @@ export class Teach {
   }
 
   show({ poses, platform, control, jog, busy }) {
+    for (const { name } of poses) sent.delete(name);
     at("teach-jog-end").hidden = !jog.ready && busy?.verb !== "jog";
     const why = control.yours ? whyNot("plan_poses", this.#page.situation()) : null;
     write(at("plan-poses-why"), why ? `${why}.` : "");
@@ -69,12 +89,18 @@ export class Teach {
   }
 
   #row(name) {
-    const { command } = this.#page;
+    const { command, situation } = this.#page;
     const field = make("input", { type: "text", value: name, maxlength: 60, "data-button": "edit_pose", "data-key": "name" });
-    field.addEventListener("change", async () => {
+    let isUnsent = false; // stale data take the focus, and typing may go on when they are current again
+    const rename = async () => {
+      isUnsent = situation().stale !== null;
+      if (isUnsent) return;
       const wanted = field.value.trim();
       if (!wanted || !(await command("rename", { pose: name, name: wanted })).ok) field.value = name;
-    });
+    };
+    field.addEventListener("change", rename);
+    field.addEventListener("blur", () => isUnsent && rename());
+    field.addEventListener("keyup", ({ key }) => key === "Enter" && isUnsent && rename());
     const button = (text, title, key, press) =>
       make("button", { type: "button", "data-button": "edit_pose", "data-title": title, "data-name": title, "data-key": key, "aria-label": title, onclick: press }, text);
     const goTo = button("Go to", `Plan a path to ${name}`, "go", () => this.#plan({ pose: name }));
