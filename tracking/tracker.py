@@ -19,6 +19,7 @@ from tracking.detection.detector import (
     nearest_to_expected,
     region_around,
 )
+from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored
 from tracking.estimator import PlatformEstimator, TrackerSettings
 from tracking.measurement import (
     NoPose,
@@ -28,7 +29,7 @@ from tracking.measurement import (
     predict,
 )
 from tracking.rolling_shutter import RecentMotion
-from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, require_unmoved_camera
+from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, CameraMoved, require_unmoved_camera
 
 # Encoder prior: where to search for the platform.
 #
@@ -259,9 +260,19 @@ class Tracker:
         )
         number, before = self._failed or (0, None)
         in_other_image = before if number != self._pictures else None
-        check = require_unmoved_camera(
-            self.camera, views, self._moved_px, in_other_image, self.rig.tag_family
-        )
+        try:
+            check = require_unmoved_camera(
+                self.camera, views, self._moved_px, in_other_image, self.rig.tag_family
+            )
+        except CameraMoved as moved:
+            if not are_mirrored(image, self._detector, (*self._frame, *self.expected_tags)):
+                raise
+            raise CameraMoved(
+                f"{MIRRORED}: they show more tags of the rig if mirrored again",
+                where=f"camera {self.camera.name!r}",
+                next_step=UNMIRROR,
+                values=moved.values,
+            ) from None
         if check is not None:
             self.camera_check = check
             self._failed = (self._pictures, check) if check.error > self._moved_px else None

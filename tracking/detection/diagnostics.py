@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -23,6 +23,12 @@ from tracking.edges.refine import RefinedTag
 DIAGNOSED = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000", "7X7_1000")
 
 
+MIRRORED = "the images are mirrored"
+"""Part of a diagnosis."""
+UNMIRROR = "turn off mirroring in the camera or its driver, and take the images again"
+"""Next step of mirrored images."""
+
+
 def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
     """Lists the unexpected tags in an image, for an error message.
 
@@ -35,10 +41,21 @@ def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
         if numbers:
             seen.append(f"{other} {', '.join(map(str, numbers))}")
     text = "; ".join(seen) or "no tag of any known family"
-    flipped = np.ascontiguousarray(image[:, ::-1])
-    if any(d.id in expected for d in TagDetector(family).detect(flipped)):
-        text += "; the expected tags appear mirrored, so the images are mirrored"
+    if are_mirrored(image, TagDetector(family), expected):
+        text += f"; the expected tags appear mirrored, so {MIRRORED}"
     return text
+
+
+def are_mirrored(image: Image, detector: TagDetector, expected: Collection[int]) -> bool:
+    """Whether an image shows more of the expected tags if it is mirrored.
+
+    Some tags are detected in both: mirrored, tag25h9 22 differs from itself in 2 bits only.
+    """
+    flipped = np.ascontiguousarray(image[:, ::-1])
+    plain, mirrored = (
+        sum(d.id in expected for d in detector.detect(one)) for one in (image, flipped)
+    )
+    return mirrored > plain
 
 
 # Numbers of neighbouring tags in a grid.
