@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from tracking.detection.detector import (
     region_around,
 )
 from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored
-from tracking.estimator import PlatformEstimator, TrackerSettings
+from tracking.estimator import CAUSE, PlatformEstimator, TrackerSettings
 from tracking.measurement import (
     NoPose,
     Observation,
@@ -104,6 +105,12 @@ class EncoderExtrapolator:
         if not (0.0 < between <= MEMORY and 0.0 < abs(ahead) <= MEMORY):
             return pose
         return interpolate(before[1], pose, 1.0 + ahead / between)
+
+
+MOVING = (
+    "or begin with the platform at rest: a rolling shutter is corrected once the velocity is known"
+)
+"""Another likely cause, of tags that contradict each other."""
 
 
 class Tracker:
@@ -191,6 +198,8 @@ class Tracker:
             )
         if self._failed is not None:
             result = NoPose(time, self._suspicion(self._failed[1]))
+        if isinstance(result, NoPose) and CAUSE in result.reason and self._is_uncorrected(time):
+            result = replace(result, reason=result.reason.replace(CAUSE, f"{CAUSE}, {MOVING}"))
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result
@@ -198,6 +207,10 @@ class Tracker:
             if by_drives is not None:
                 self._prior.learn(result.pose, by_drives)
         return result
+
+    def _is_uncorrected(self, time: float) -> bool:
+        """Whether a rolling shutter is not corrected, since the platform's motion is unknown."""
+        return self.camera.readout != 0.0 and self._recent.covariance(time) is None
 
     def _follow(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
         """The pose near the predicted one, or None if it is not there.
