@@ -20,7 +20,7 @@ from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, pixels_of
 from tracking.clearance import MeasuredClearance, clearance_of, require_stated_errors
-from tracking.detection.diagnostics import SOFT, diagnose_tags, edge_width
+from tracking.detection.diagnostics import MIRRORED, SOFT, UNMIRROR, diagnose_tags, edge_width
 from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.estimator import ROTATED, UNCERTAIN, UNSHARP
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
@@ -161,7 +161,9 @@ def _nothing_seen(
     )
     reason, why = reasons.most_frequent(), ""
     soft = edge_width(last.image) > SOFT
-    if UNCERTAIN in reason and not soft:
+    if MIRRORED in instead:
+        next_step = UNMIRROR
+    elif UNCERTAIN in reason and not soft:
         next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"
     elif PERHAPS_MOVED in reason:
         next_step = "take more images; if the camera moved, restore it or calibrate its pose again"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +20,8 @@ from tracking.detection.detector import (
     nearest_to_expected,
     region_around,
 )
-from tracking.estimator import PlatformEstimator, TrackerSettings
+from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored
+from tracking.estimator import CAUSE, PlatformEstimator, TrackerSettings
 from tracking.measurement import (
     NoPose,
     Observation,
@@ -28,7 +30,7 @@ from tracking.measurement import (
     predict,
 )
 from tracking.rolling_shutter import RecentMotion
-from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, require_unmoved_camera
+from tracking.shared_errors import PERHAPS_MOVED, CameraCheck, CameraMoved, require_unmoved_camera
 
 # Encoder prior: where to search for the platform.
 #
@@ -103,6 +105,12 @@ class EncoderExtrapolator:
         if not (0.0 < between <= MEMORY and 0.0 < abs(ahead) <= MEMORY):
             return pose
         return interpolate(before[1], pose, 1.0 + ahead / between)
+
+
+MOVING = (
+    "or begin with the platform at rest: a rolling shutter is corrected once the velocity is known"
+)
+"""Another likely cause, of tags that contradict each other."""
 
 
 class Tracker:
@@ -190,6 +198,8 @@ class Tracker:
             )
         if self._failed is not None:
             result = NoPose(time, self._suspicion(self._failed[1]))
+        if isinstance(result, NoPose) and CAUSE in result.reason and self._is_uncorrected(time):
+            result = replace(result, reason=result.reason.replace(CAUSE, f"{CAUSE}, {MOVING}"))
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result
@@ -197,6 +207,10 @@ class Tracker:
             if by_drives is not None:
                 self._prior.learn(result.pose, by_drives)
         return result
+
+    def _is_uncorrected(self, time: float) -> bool:
+        """Whether a rolling shutter is not corrected, since the platform's motion is unknown."""
+        return self.camera.readout != 0.0 and self._recent.covariance(time) is None
 
     def _follow(self, image: Image, time: float, last: PoseMeasurement) -> Observation | None:
         """The pose near the predicted one, or None if it is not there.
@@ -259,9 +273,19 @@ class Tracker:
         )
         number, before = self._failed or (0, None)
         in_other_image = before if number != self._pictures else None
-        check = require_unmoved_camera(
-            self.camera, views, self._moved_px, in_other_image, self.rig.tag_family
-        )
+        try:
+            check = require_unmoved_camera(
+                self.camera, views, self._moved_px, in_other_image, self.rig.tag_family
+            )
+        except CameraMoved as moved:
+            if not are_mirrored(image, self._detector, (*self._frame, *self.expected_tags)):
+                raise
+            raise CameraMoved(
+                f"{MIRRORED}: they show more tags of the rig if mirrored again",
+                where=f"camera {self.camera.name!r}",
+                next_step=UNMIRROR,
+                values=moved.values,
+            ) from None
         if check is not None:
             self.camera_check = check
             self._failed = (self._pictures, check) if check.error > self._moved_px else None

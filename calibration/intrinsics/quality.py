@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -306,7 +307,8 @@ def _size_issues(result: CameraCalibration) -> list[Issue]:
                 what = f"gaps of {gap * 1e3:.3g} mm between tags of {grid.tag * 1e3:g} mm"
                 what += f", not {grid.gap * 1e3:g} mm"
         case Charuco() as board:
-            side = float(np.median([seen.marker for seen in result.views.values()]))
+            sides = [s.marker for s in result.views.values() if not math.isnan(s.marker)]
+            side = float(np.median(sides or [board.marker]))
             if abs(side / board.marker - 1.0) > _OTHER_MARKER:
                 options = "--square-mm or --marker-mm, in Python square= or marker="
                 what = f"markers of about {side * 1e3:.2g} mm in squares of {board.square * 1e3:g}"

@@ -24,7 +24,7 @@ from tracking.camera_model import (
     rms,
 )
 from tracking.detection.detector import Detection, make_detector
-from tracking.detection.diagnostics import diagnose_tags
+from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored, diagnose_tags
 from tracking.detection.tags import CORNER_SIGNS, modules_across
 from tracking.edges.refine import RefinedTag, refine
 from tracking.estimator import TrackerSettings
@@ -94,7 +94,7 @@ def observe_tags(
         unused: Images already left out, with the reasons.
 
     Raises:
-        BadInput: No image shows any of them completely.
+        BadInput: No image shows any of them completely, or the images are mirrored.
     """
     family = rig.tag_family
     detector, modules = make_detector(rig.tag_detector, family), modules_across(family)
@@ -112,6 +112,12 @@ def observe_tags(
         left_out |= {f"{name}, tag {number}": "is detected more than once" for number in twice}
         squares = _whole(image, camera, [d for d in mine if d.id not in twice], modules)
         if squares:
+            if not found and are_mirrored(image, detector, wanted):
+                raise BadInput(
+                    f"{MIRRORED}: {name} shows more tags of the rig if mirrored again",
+                    where=f"camera {camera.name}",
+                    next_step=UNMIRROR,
+                )
             found[name] = squares
         elif not twice:
             left_out[name] = "shows no complete tag"
@@ -162,12 +168,15 @@ def _nothing_seen(
     if example is not None:
         name, image = example
         why += f"; {name} shows {diagnose_tags(image, family, list(wanted))}"
+    step = (
+        "check that the camera sees them, that the light suffices, and that the rig file has the"
+        " family and numbers of the printed tags"
+    )
     return BadInput(
         f"none of the {family} tags {', '.join(map(str, wanted))} is completely visible",
         where=f"camera {camera.name}",
         why=why,
-        next_step="check that the camera sees them, that the light suffices, and that the rig file"
-        " has the family and numbers of the printed tags",
+        next_step=UNMIRROR if MIRRORED in why else step,
     )
 
 

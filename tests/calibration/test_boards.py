@@ -35,6 +35,7 @@ from tracking.detection.diagnostics import RowNumbering, row_numbering, tag_offs
 
 CHARUCO = Charuco(7, 5, 0.040, 0.030, "4X4_50")
 TAGS = TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=20)
+BARREL = np.array([-0.45, 0.25, 0.0, 0.0, -0.05])
 PIXEL = 0.0005
 
 
@@ -226,21 +227,53 @@ def test_points_are_found_where_they_are(board: Charuco | TagGrid, limit: float)
 def test_saddles_of_charuco_boards_are_not_biased_by_markers_or_blur(
     board: Charuco, times: float, blur: float, limit: float
 ) -> None:
-    """OpenCV's print has markers off the middle of their squares by up to a pixel of 40."""
+    shown = charuco_pictures(board, times, blur)
+    errors = off(board, shown)
+    assert len(errors) > 20
+    assert np.sqrt(np.mean(errors**2)) < limit
+    assert np.abs(errors).max() < 8.0 * limit
+    assert np.abs(errors.mean(axis=0)).max() < limit / 2.0
+
+
+@pytest.mark.parametrize(
+    ("board", "times", "blur", "lens"),
+    [
+        (CHARUCO, 1.0, 0.7, DISTORTION),
+        (CHARUCO, 0.7, 0.7, BARREL),
+        (Charuco(8, 6, 0.040, 0.0293, "5X5_100"), 1.0, 1.2, DISTORTION),
+        (Charuco(8, 6, 0.040, 0.030, "5X5_100"), 2.0, 0.0, DISTORTION),
+        (Charuco(5, 7, 0.040, 0.020, "6X6_250"), 1.0, 0.7, DISTORTION),
+    ],
+)
+@pytest.mark.parametrize("stated", [1.0, 0.85])
+def test_the_size_of_markers_is_measured_whatever_is_stated(
+    board: Charuco, times: float, blur: float, lens: np.ndarray, stated: float
+) -> None:
+    wrong = replace(board, marker=stated * board.marker)
+    seen = [wrong.find(image) for image, _ in charuco_pictures(board, times, blur, lens)]
+    sides = np.array([one.marker for one in seen if one is not None]) / board.marker
+    measured = sides[np.isfinite(sides)]  # squares whose four corners are seen
+    assert len(measured) > 3
+    assert np.abs(measured - 1.0).max() < 0.02
+
+
+def charuco_pictures(
+    board: Charuco, times: float, blur: float, lens: np.ndarray = DISTORTION
+) -> list[tuple[np.ndarray, Pose]]:
+    """A board at several times the usual distance, in blurred images.
+
+    OpenCV's print has markers off the middle of their squares by up to a pixel of 40.
+    """
     sheet = board._board.generateImage((40 * board.columns, 40 * board.rows), marginSize=0)
     sheet, middle = np.kron(sheet, np.ones((3, 3), np.uint8)), np.array([0.14, 0.1, 0.0])
     shown = []
     for k, pose in enumerate(poses_before_the_camera(middle, 6, seed=7)):
         far = replace(pose, position=(pose.position + pose.rotation @ middle) * times)
         far = replace(far, position=far.position - pose.rotation @ middle)
-        image = picture_of(sheet, board.square / 120, np.zeros(2), far)
+        image = picture_of(sheet, board.square / 120, np.zeros(2), far, tuple(lens))
         image = cv2.GaussianBlur(image, (0, 0), blur) if blur else image
         shown.append((with_noise(image, k), far))
-    errors = off(board, shown)
-    assert len(errors) > 20
-    assert np.sqrt(np.mean(errors**2)) < limit
-    assert np.abs(errors).max() < 8.0 * limit
-    assert np.abs(errors.mean(axis=0)).max() < limit / 2.0
+    return shown
 
 
 def test_corners_of_charuco_boards_without_a_saddle_are_left_out() -> None:
@@ -442,7 +475,7 @@ def test_right_sizes_of_a_board_are_not_questioned() -> None:
         assert not any("the images fit" in reason for reason in right.verdict.reasons)
 
 
-@pytest.mark.parametrize("marker_mm", [24.0, 36.0])
+@pytest.mark.parametrize("marker_mm", [24.0, 26.7, 36.0])
 def test_a_wrong_size_of_markers_is_named(marker_mm: float, capfd) -> None:
     """OpenCV itself only warns, on standard error, of markers almost as large as their squares."""
     images = whole_pictures(CHARUCO, 16)

@@ -108,6 +108,7 @@ def test_a_charuco_board_in_a_colour_photograph_is_flat() -> None:
     seen = Charuco(5, 7, 0.04, 0.02, "6X6_250").find(image)
     assert seen is not None
     assert len(seen.points) == 24
+    assert seen.marker == pytest.approx(0.02, rel=0.02)
     flat = seen.points[:, :2].astype(np.float32)
     turn, _ = cv2.findHomography(flat, seen.corners.astype(np.float32))
     there = cv2.perspectiveTransform(flat.reshape(-1, 1, 2), turn).reshape(-1, 2)

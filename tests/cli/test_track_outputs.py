@@ -92,6 +92,7 @@ def test_mirrored_images_are_reported(tmp_path: Path) -> None:
     one_message(
         answer, 2, "a.png shows no tag of any known family; the expected tags appear mirrored"
     )
+    assert "turn off mirroring in the camera or its driver" in " ".join(answer.err.split())
 
 
 def test_tags_that_differ_from_the_rig_file_are_named_as_the_cause(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from tracking.rolling_shutter import RecentMotion
 from tracking.tracker import Tracker
 
 READOUT, RATE = 0.03, 20.0
+FAST = [0.0, 0.0, 0.4]
 VELOCITY = {"down": [0.0, 0.0, -0.1], "along": [0.1, 0.0, 0.0]}
 
 
@@ -90,6 +91,15 @@ def test_a_moving_platform_is_measured_at_the_middle_rows_time(
     assert np.degrees(max(angles)) < 0.05
     unknown, known = (one.position_deviation.max() for one in poses[:2])
     assert unknown > 2.0 * known
+
+
+def test_a_fast_motion_from_the_first_image_on_is_named_beside_wrong_tags(rig, camera) -> None:
+    """Without a pose the velocity stays unknown, so the rows are not corrected."""
+    reasons = [found.reason for found, _ in flown(rig, camera, READOUT, FAST, images=2)]
+    assert all("compare size_mm" in reason for reason in reasons)
+    assert all("or begin with the platform at rest" in reason for reason in reasons)
+    unstated = [found.reason for found, _ in flown(rig, camera, 0.0, FAST, images=2)]
+    assert not any("begin with the platform at rest" in reason for reason in unstated)
 
 
 def test_without_the_readout_the_same_images_measure_a_millimetre_wrong(rig, camera) -> None:

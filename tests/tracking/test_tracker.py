@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from calibration.tag_map.observations import observe_tags
 from model.errors import BadInput
 from model.pose import (
     Array,
@@ -21,6 +22,8 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tracking.camera_model import Image, pixels_of
+from tracking.detection.detector import TagDetector
+from tracking.detection.diagnostics import diagnose_tags
 from tracking.estimator import TrackerSettings
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.shared_errors import CameraMoved
@@ -147,6 +150,37 @@ def test_a_moved_camera_is_reported_with_the_distance(
     assert float(caught.value.values["moved_mm"]) == pytest.approx(6.0, abs=1.0)
     assert float(caught.value.values["turned_deg"]) == pytest.approx(0.5, abs=0.05)
     assert "world_from_camera" in caught.value.next_step
+
+
+def test_mirrored_images_are_named_where_a_frame_tag_looks_alike_in_a_mirror(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
+    """Mirrored, tag25h9 22 is read as 22, since it differs from itself in 2 bits only."""
+    frame = tuple(replace(tag, id=22 + k) for k, tag in enumerate(rig.frame_tags))
+    platform = tuple(replace(tag, id=k) for k, tag in enumerate(rig.platform_tags))
+    rig = replace(rig, tag_family="tag25h9", frame_tags=frame, platform_tags=platform)
+    real, truth = SyntheticCamera(rig, scene, camera, seed=1), Pose.level([0.0, 0.0, 0.445])
+    images = [np.ascontiguousarray(real.render(truth, k)[:, ::-1]) for k in range(2)]
+    tracker = Tracker(rig, camera)
+    assert isinstance(tracker.observe(images[0], 0.0), NoPose)
+    with pytest.raises(CameraMoved, match="the images are mirrored") as caught:
+        tracker.observe(images[1], 0.1)
+    assert caught.value.values["frame_tags"] == "22"
+    assert "turn off mirroring" in caught.value.next_step
+    with pytest.raises(BadInput, match=r"the images are mirrored: a\.png shows"):
+        observe_tags([("a.png", images[0])], rig, camera, [tag.id for tag in frame])
+    assert len(observe_tags([("a.png", real.render(truth, 0))], rig, camera, [22]).squares) == 1
+
+
+def test_a_tag_that_looks_alike_in_a_mirror_does_not_show_that_images_are_mirrored(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
+    platform = tuple(replace(tag, id=22 + k) for k, tag in enumerate(rig.platform_tags))
+    rig = replace(rig, tag_family="tag25h9", frame_tags=(), platform_tags=platform)
+    image = SyntheticCamera(rig, scene, camera, seed=1).render(Pose.level([0.0, 0.0, 0.445]), 0)
+    seen = [d.id for d in TagDetector("tag25h9").detect(image)]
+    assert 22 in seen
+    assert "mirrored" not in diagnose_tags(image, "tag25h9", seen)
 
 
 def test_a_camera_moved_during_a_run_is_noticed(

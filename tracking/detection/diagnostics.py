@@ -1,9 +1,10 @@
-"""Diagnosis of images: unexpected tags, grids of tags, motion blur, sharpening, overexposure."""
+"""Diagnosis of images: unexpected tags, grids and sizes of tags, blur, sharpening, overexposure."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -22,6 +23,12 @@ from tracking.edges.refine import RefinedTag
 DIAGNOSED = (*(f for f in APRILTAG_FAMILIES if f != "tag16h5"), "5X5_1000", "6X6_1000", "7X7_1000")
 
 
+MIRRORED = "the images are mirrored"
+"""Part of a diagnosis."""
+UNMIRROR = "turn off mirroring in the camera or its driver, and take the images again"
+"""Next step of mirrored images."""
+
+
 def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
     """Lists the unexpected tags in an image, for an error message.
 
@@ -34,10 +41,21 @@ def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
         if numbers:
             seen.append(f"{other} {', '.join(map(str, numbers))}")
     text = "; ".join(seen) or "no tag of any known family"
-    flipped = np.ascontiguousarray(image[:, ::-1])
-    if any(d.id in expected for d in TagDetector(family).detect(flipped)):
-        text += "; the expected tags appear mirrored, so the images are mirrored"
+    if are_mirrored(image, TagDetector(family), expected):
+        text += f"; the expected tags appear mirrored, so {MIRRORED}"
     return text
+
+
+def are_mirrored(image: Image, detector: TagDetector, expected: Collection[int]) -> bool:
+    """Whether an image shows more of the expected tags if it is mirrored.
+
+    Some tags are detected in both: mirrored, tag25h9 22 differs from itself in 2 bits only.
+    """
+    flipped = np.ascontiguousarray(image[:, ::-1])
+    plain, mirrored = (
+        sum(d.id in expected for d in detector.detect(one)) for one in (image, flipped)
+    )
+    return mirrored > plain
 
 
 # Numbers of neighbouring tags in a grid.
@@ -133,6 +151,68 @@ def edge_width(image: Image) -> float:
     low, high = np.percentile(smooth, (2.0, 98.0))
     steepest = float(np.percentile(np.hypot(across, down), 99.8))
     return float(high - low) / max(steepest, 1e-9)
+
+
+# Size of printed markers.
+
+
+#: Corners of a square of side 1.
+UNIT_SQUARE = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+#: Numbers of positions along an edge and of distances from it at which brightness is read, and the
+#: part of the edge that is read: near its ends, paper is on two sides.
+_ALONG, _ACROSS, _PART = 7, 15, (0.2, 0.8)
+#: Brightness is read from the middle of the black border, [modules], to this share of the paper up
+#: to the next square, at most this far, [modules].
+_INK, _PAPER, _MOST_PAPER = 0.5, 0.85, 0.8
+
+
+def printed_share(image: Image, markers: Array, squares: Array, modules: int) -> float:
+    """Median side of markers as a share of the squares around them, by the ink across their edges.
+
+    OpenCV's corners lie in the ink, by 0.6 px and more, so they only show where the edges are.
+
+    Args:
+        image: Grey image of black markers on paper.
+        markers: Corners of n markers by OpenCV, shape (n, 4, 2), [px].
+        squares: Corners of the paper around each, shape (n, 4, 2), [px]; NaN where unknown.
+        modules: Along the side of a marker.
+
+    Returns:
+        The share; NaN if all squares are unknown.
+    """
+    known = np.isfinite(squares).all(axis=(1, 2))
+    if not known.any():
+        return math.nan
+    planes = squares[known].astype(np.float32)
+    flat = _transformed(
+        np.array([cv2.getPerspectiveTransform(plane, UNIT_SQUARE) for plane in planes]),
+        markers[known],
+    )
+    edges = np.roll(flat, -1, axis=1) - flat
+    sides = np.linalg.norm(edges, axis=2).mean(axis=1)
+    side = float(np.median(sides))
+    # Distances from the middle at which brightness is read, in half sides.
+    first = 1.0 - 2.0 * _INK / modules
+    last = 1.0 + max(0.0, min(_PAPER * (1.0 / side - 1.0), 2.0 * _MOST_PAPER / modules))
+    middles = flat.mean(axis=1)[:, None, None, None]
+    on_edges = flat[:, :, None] + np.linspace(*_PART, _ALONG)[:, None] * edges[:, :, None]
+    lines = middles + np.linspace(first, last, _ACROSS)[:, None, None] * (
+        on_edges[:, :, None] - middles
+    )
+    back = np.array([cv2.getPerspectiveTransform(UNIT_SQUARE, plane) for plane in planes])
+    x, y = np.moveaxis(_transformed(back, lines.reshape(len(flat), -1, 2)), 2, 0).astype(np.float32)
+    read = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    brightness = read.reshape(lines.shape[:4]).mean(axis=3)
+    black, white = brightness.min(axis=2, keepdims=True), brightness.max(axis=2, keepdims=True)
+    ink = (white - brightness) / np.maximum(white - black, 1.0)
+    reach = first + (last - first) * (ink[..., 1:] + ink[..., :-1]).mean(axis=2) / 2.0
+    return float(np.median(sides * reach.mean(axis=1)))
+
+
+def _transformed(homographies: Array, points: Array) -> Array:
+    """Points, shape (n, k, 2), each set by its homography, shape (n, 3, 3)."""
+    found = points @ homographies[:, :, :2].transpose(0, 2, 1) + homographies[:, None, :, 2]
+    return np.asarray(found[..., :2] / found[..., 2:])
 
 
 # Image faults from the edges of tags.
