@@ -106,7 +106,7 @@ class ReplyCounts:
 
     def largest_share(self, names: Sequence[str]) -> str:
         """Text of the event on the drives with the most missing replies; empty if none is."""
-        most = max(self.lost, default=0)
+        most = max(self.lost)
         if not most:
             return ""
         losing = [name for name, count in zip(names, self.lost, strict=True) if count == most]
