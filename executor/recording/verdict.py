@@ -124,11 +124,7 @@ def judge(
         *encoder_pose(cycles),
         *camera(poses, course.cameras, began),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
-        *(
-            [Check("held", False, f"Some drives may not hold: {unheld}. {_SECURE}")]
-            if unheld
-            else []
-        ),
+        *unheld,
         *(Check("record", False, f"{trouble}.") for trouble in course.troubles),
     ]
     failures = [check for check in measured if not check.passed]
@@ -154,16 +150,15 @@ def judge(
     return Verdict(FAILED, f"The run {word} {where}.", (end, *measured))
 
 
-def _cause(context: RunContext) -> tuple[str, str]:
-    """Why a run did not finish, and what was reported besides it of drives that may not hold."""
+def _cause(context: RunContext) -> tuple[str, list[Check]]:
+    """Why a run did not finish, and a failed check if besides that drives may not hold."""
     cause = context.course.cause or next((event.text for event in reversed(context.events)), "")
     texts = [*dict.fromkeys(event.text for event in context.events if event.code in UNHELD)]
     for text in reversed(texts):  # the latch keeps all, see `Loop`
         cause = cause.removesuffix(f"; {text}")
-    return cause, "; ".join(text for text in texts if text not in cause)
-
-
-_SECURE = "Support the platform and press the emergency stop."
+    later = "; ".join(text for text in texts if text not in cause)
+    what = f"Some drives may not hold: {later}. Support the platform and press the emergency stop."
+    return cause, [Check("held", False, what)] if later else []
 
 
 def _is_at_goal(cycles: CycleTable, scene: Scene) -> bool:
