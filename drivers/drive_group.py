@@ -137,7 +137,8 @@ class CycleStatus:
             cable and drive, and the node is `WHOLE_BUS` for a fault of the bus.
         state: State of the group.
         holding: Whether every cable is held, by its drive under torque or by its closed brake.
-        stopped: Whether every drive reported in this cycle that it follows no set-points.
+        stopped: Whether every drive follows no set-points, as it last reported: a missing one did
+            so in an earlier cycle.
         rejected: Number of frames rejected since `configure` for wrong length or implausible
             content.
         error_frames: Number of error frames since `configure`.

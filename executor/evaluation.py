@@ -42,11 +42,13 @@ from executor.recording.run_folder import (
 from executor.recording.summary import summarize
 from executor.recording.tables import OK, CycleTable, PoseTable, fused_table
 from executor.recording.verdict import (
+    FAILED,
     HARMLESS,
     NOT_ENDED,
     ORDINARY,
+    Check,
     RunContext,
-    judge_without_tables,
+    Verdict,
 )
 from executor.report import build_report
 from executor.state_machine import State
@@ -195,7 +197,7 @@ def not_evaluated(
     prepared: PreparedRun, outcome: Outcome, course: RunCourse, trouble: str
 ) -> dict[str, Any]:
     """A summary without tables, where these could not be computed."""
-    verdict = judge_without_tables(course.final_state, course.cause, trouble)
+    verdict = _judge_without_tables(course.final_state, course.cause, trouble)
     return {
         "schema_version": 1,
         "verdict": verdict.word,
@@ -209,6 +211,24 @@ def not_evaluated(
         "cycles": len(outcome.log),
         "events": [asdict(event) for event in outcome.log.events],
     }
+
+
+def _judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
+    """The verdict on a run whose tables could not be computed.
+
+    Args:
+        final_state: ``finished``, ``stopped`` or any other for a fault.
+        cause: Why it did not finish, if it did not.
+        trouble: Why there are no tables.
+    """
+    known = Check("evaluated", False, f"The measurements could not be evaluated: {trouble}.")
+    if final_state == "finished":
+        end = Check("finished", True, "The platform reached the goal.")
+        return Verdict(FAILED, "The run reached the goal, but was not evaluated.", (end, known))
+    word = "was stopped" if final_state == "stopped" else "ended with a fault"
+    cause_text = cause.rstrip(".") or f"the final state is {final_state!r}"
+    end = Check("finished", False, f"The run ended before the goal: {cause_text}.")
+    return Verdict(FAILED, f"The run {word} before the goal.", (end, known))
 
 
 def write_end(

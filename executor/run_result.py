@@ -20,6 +20,7 @@ from executor.recording.record_files import free_folder
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import faults_among
+from executor.safety.fault_messages import UNHELD
 from model.errors import BadInput, path_of
 from model.files.reading import TABLE_LIMIT
 from model.pages.page import html_table
@@ -105,7 +106,7 @@ class RunResult:
             return "check the report for exceeded limits before the next run"
         if self.summary.get("interface") == IN_PROCESS:
             return "find the cause, then run again into a new folder"
-        if "drive_fault" in {event["code"] for event in self.summary["events"]}:
+        if not {event["code"] for event in self.summary["events"]}.isdisjoint(UNHELD):
             return (
                 "find the cause and check the platform; `cdpr status RIG` shows whether to run"
                 " `cdpr release RIG` or to press the emergency stop before `cdpr reset RIG`"

@@ -393,7 +393,7 @@ class Cia402Group(CyclicGroup):
             faults=tuple(self._faults),
             state=self._state,
             holding=all(s in HOLDS for s in watch.states),
-            stopped=DriveState.OPERATION_ENABLED not in watch.states and not missing.any(),
+            stopped=DriveState.OPERATION_ENABLED not in watch.states,
             rejected=watch.rejected,
             error_frames=self._cyclic.error_frames,
             warnings=self._warnings,

@@ -348,7 +348,7 @@ class OdriveGroup(CyclicGroup):
             faults=tuple(self._faults),
             state=self._state,
             holding=braked or watch.in_state(AxisState.CLOSED_LOOP_CONTROL),
-            stopped=not following and self._all_disarmed() and not missing.any(),
+            stopped=not following and self._all_disarmed(),
             rejected=watch.rejected,
             error_frames=self._cyclic.error_frames,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +18,7 @@ from executor.safety.limits import gate_limits, monitor_limits, stuck_limits
 from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckWatch
 from executor.trajectory.setpoints import CheckedSetpoints
-from executor.trajectory.time_scaling import smooth_step_duration, speed_change
+from executor.trajectory.time_scaling import smooth_step, smooth_step_duration, speed_change
 from model.pose import Array
 from model.rig import Motion
 
@@ -205,6 +206,11 @@ class Cycle:
         """Targets that keep the drives still."""
         return self.targets or self.actual
 
+    @property
+    def largest_share_lost(self) -> str:
+        """See `ReplyCounts.largest_share`."""
+        return self._watch.replies.largest_share(self._watch.names)
+
     def allow(self, setpoints: NDArray[np.int32]) -> None:
         """From now on the gate allows the range of these set-points, shape (n, m)."""
         self._limits = gate_limits(self._rig, setpoints, self._rig.cycle)
@@ -217,6 +223,14 @@ class Cycle:
         speed = min(motion.speed, *(winch.max_speed for winch in self._rig.winches))
         cycles = SETTLING + math.ceil(2.0 * travel / (speed * cycle))
         return max(cycles, math.ceil(smooth_step_duration(travel, motion) / cycle))
+
+    def approach(self, end: Array) -> Iterator[tuple[int, ...]]:
+        """Targets of each cycle of a smooth motion to drive positions, shape (m,), [counts]."""
+        begin = np.array(self.targets, dtype=np.float64)
+        steps = self.approach_cycles(begin, end)
+        for step in range(1, steps + 1):
+            share = smooth_step(step / steps)
+            yield tuple(int(v) for v in np.rint(begin + share * (end - begin)))
 
     def allows(self, purpose: Purpose, targets: tuple[int, ...]) -> GateDecision:
         """Decision of the gate on targets now."""

@@ -14,11 +14,11 @@ import numpy as np
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
-from drivers.factory import holding_nodes, may_have_released, stop_alone
+from drivers.factory import holding_nodes, may_have_released
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_checked
-from executor.control.sync_master import SyncMaster, changed_states
-from executor.safety.fault_messages import Alarm, AlarmHistory, StopReaction, shared_causes
+from executor.control.sync_master import SyncMaster, changed_states, hold_timeout_text, lost_states
+from executor.safety.fault_messages import UNHELD, Alarm, AlarmHistory, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
 from executor.supervision import (
@@ -29,7 +29,6 @@ from executor.supervision import (
     record_failure,
 )
 from executor.trajectory.setpoints import CheckedSetpoints
-from executor.trajectory.time_scaling import smooth_step
 from model.errors import CdprError, Refused
 
 #: Failures of the bus in a row after which it is given up while drives stop.
@@ -67,6 +66,7 @@ class Loop:
         self._path_stop = f"stopped {self.motion_phrase}"
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = self._requested = self._listener_error = ""
+        self._unheld: list[str] = []  # texts of events on drives that may not hold
         self.error: CdprError | None = None
         """None here: the end of a run is reported by its cause."""
         self.holding = True
@@ -127,6 +127,9 @@ class Loop:
         except BaseException:
             self._fault("broken", "the program was terminated")
             raise
+        if lost := self._sender.largest_share_lost:
+            self._report("reply_lost", lost)
+        self.cause = "; ".join([self.cause, *(t for t in self._unheld if t not in self.cause)])
         return self.machine.state
 
     def _one_step(self) -> None:
@@ -160,12 +163,7 @@ class Loop:
 
     def _approach(self) -> None:
         """Moves smoothly to the first row, by at most the start tolerance."""
-        begin = np.array(self._sender.targets, dtype=np.float64)
-        end = self._checked.setpoints[0].astype(np.float64)
-        steps = self._sender.approach_cycles(begin, end)
-        for step in range(1, steps + 1):
-            share = smooth_step(step / steps)
-            targets = tuple(int(v) for v in np.rint(begin + share * (end - begin)))
+        for targets in self._sender.approach(self._checked.setpoints[0].astype(np.float64)):
             self._send(Purpose.MOVE, targets)
             if self.machine.state is not State.APPROACHING:
                 return
@@ -197,10 +195,11 @@ class Loop:
             status = self._send(Purpose.HOLD, self._sender.resting_targets)
             if self.machine.state is not State.SECURING:
                 return
+            # One reply may be missing; `MISSING_CYCLES` in a row are a fault.
             if status is not None and status.stopped and (status.holding or not was_enabled):
                 self._leave(status)
                 return
-        self._fault("hold_timeout", f"the drives did not hold within {within:.3g} s")
+        self._fault("hold_timeout", hold_timeout_text(self._rig, status, within))
 
     def _leave(self, held: CycleStatus) -> None:
         """Ends monitoring of drives that hold on their own, and reads their state again."""
@@ -390,11 +389,10 @@ class Loop:
             self._report("bus_lost", text)
             self._note_end(None)
             return
-        if before is None or (left.holding and left.stopped):
+        if before is None or (left.holding and left.stopped and not left.missing.any()):
             return
         self._note_end(left)
-        held = np.array(stop_alone(self._rig, before.status_words.tolist())) & ~before.missing
-        if otherwise := changed_states(self._rig, before, left, np.flatnonzero(~held).tolist()):
+        if otherwise := lost_states(self._rig, before, left, (self.cause, *self._unheld)):
             self._report("not_held", otherwise)
 
     def _one_more_latched(self) -> bool:
@@ -434,6 +432,8 @@ class Loop:
             self.cause = text
 
     def _report(self, code: str, text: str) -> None:
+        if code in UNHELD:
+            self._unheld.append(text)
         event = LoopEvent(self._cycle, self._clock.time, code, text)
         self._call_listener(lambda: self._calls.on_event(event))
 

@@ -12,12 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
+from itertools import compress
 from typing import TypeVar
 
 import numpy as np
 
 from drivers.drive_group import CycleStatus, DriveGroup, GroupCommand, GroupState
-from drivers.factory import drive_flags, drive_states
+from drivers.factory import drive_flags, drive_states, stop_alone
 from executor.realtime.scheduling import Clock
 from executor.safety.fault_messages import name_drives
 from executor.safety.monitor import MISSING_CYCLES
@@ -304,6 +305,40 @@ def changed_states(
     if changed:
         found.append(f"drives left the state they held in: {', '.join(changed)}")
     return "; ".join(found)
+
+
+def lost_states(rig: Rig, before: CycleStatus, after: CycleStatus, reported: Sequence[str]) -> str:
+    """`changed_states` after a stop, without drives that hold, never held or are reported.
+
+    Args:
+        rig: The robot.
+        before: As for `changed_states`.
+        after: As for `changed_states`.
+        reported: Texts on this stop so far.
+    """
+    names, texts = tuple(rig.drive_names.values()), "; ".join(reported)
+    everyone, _ = name_drives(names, len(names))
+    excluded = []
+    for drive, (held, holds) in enumerate(
+        zip(*(stop_alone(rig, s.status_words.tolist()) for s in (before, after)), strict=True)
+    ):
+        is_reported = names[drive] in texts or everyone in texts
+        known = is_reported if before.missing[drive] else not held
+        if known or (holds and not after.missing[drive]):
+            excluded.append(drive)
+    return changed_states(rig, before, after, excluded)
+
+
+def hold_timeout_text(rig: Rig, status: CycleStatus | None, within: float) -> str:
+    """States that drives did not hold within a time [s]: which, and which replies are missing."""
+    texts = [f"the drives did not hold within {within:.3g} s"]
+    if status is not None:
+        words, names = status.status_words.tolist(), tuple(rig.drive_names.values())
+        rows = zip(names, drive_states(rig, words), stop_alone(rig, words), strict=True)
+        texts += [f"{name} is in {state}" for name, state, holds in rows if not holds]
+        if silent := list(compress(names, status.missing.tolist())):
+            texts.append(f"no reply from {', '.join(silent)} in the last cycle")
+    return "; ".join(texts)
 
 
 def late_fault(age: float) -> Fault:

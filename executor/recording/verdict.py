@@ -14,7 +14,7 @@ from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord, RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
-from executor.safety.fault_messages import NO_MORE
+from executor.safety.fault_messages import LARGEST_SHARE, NO_MORE, UNHELD
 from executor.safety.limits import tension_limits
 from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
@@ -115,6 +115,7 @@ def judge(
     course, rig, scene = context.course, context.rig, context.plan.scene
     final_state, began = course.final_state, cycles.path_began
     warnings = dict.fromkeys(t.removesuffix(NO_MORE) for t in context.texts_of("drive_warning"))
+    cause, unheld = _cause(context)
     measured = [
         following(cycles, rig.motion.following_error),
         replies(cycles, context),
@@ -123,6 +124,7 @@ def judge(
         *encoder_pose(cycles),
         *camera(poses, course.cameras, began),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
+        *unheld,
         *(Check("record", False, f"{trouble}.") for trouble in course.troubles),
     ]
     failures = [check for check in measured if not check.passed]
@@ -138,7 +140,6 @@ def judge(
     if final_state == NOT_ENDED:
         end = Check("finished", False, f"Its record ends {at}. {_KILLED}")
         return Verdict(FAILED, "The run did not finish.", (end, *measured))
-    cause = course.cause or next((event.text for event in reversed(context.events)), "")
     cause = cause.rstrip(".") or f"the final state is {final_state!r}"
     where = "at the goal" if _is_at_goal(cycles, scene) else "before the goal"
     end = Check("finished", False, f"The run ended {at}, {where}: {cause}.")
@@ -147,6 +148,17 @@ def judge(
         return Verdict(STOPPED, f"The run was stopped {where}.", (end, *measured))
     word = "was stopped" if final_state == "stopped" else "ended with a fault"
     return Verdict(FAILED, f"The run {word} {where}.", (end, *measured))
+
+
+def _cause(context: RunContext) -> tuple[str, list[Check]]:
+    """Why a run did not finish, and a failed check if besides that drives may not hold."""
+    cause = context.course.cause or next((event.text for event in reversed(context.events)), "")
+    texts = [*dict.fromkeys(event.text for event in context.events if event.code in UNHELD)]
+    for text in reversed(texts):  # the latch keeps all, see `Loop`
+        cause = cause.removesuffix(f"; {text}")
+    later = "; ".join(text for text in texts if text not in cause)
+    what = f"Some drives may not hold: {later}. Support the platform and press the emergency stop."
+    return cause, [Check("held", False, what)] if later else []
 
 
 def _is_at_goal(cycles: CycleTable, scene: Scene) -> bool:
@@ -162,24 +174,6 @@ _KILLED = (
     "Its program was killed, the computer stopped, or its end could not be recorded;"
     " what happened after that is unknown."
 )
-
-
-def judge_without_tables(final_state: str, cause: str, trouble: str) -> Verdict:
-    """The verdict on a run whose tables could not be computed.
-
-    Args:
-        final_state: ``finished``, ``stopped`` or any other for a fault.
-        cause: Why it did not finish, if it did not.
-        trouble: Why there are no tables.
-    """
-    known = Check("evaluated", False, f"The measurements could not be evaluated: {trouble}.")
-    if final_state == "finished":
-        end = Check("finished", True, "The platform reached the goal.")
-        return Verdict(FAILED, "The run reached the goal, but was not evaluated.", (end, known))
-    word = "was stopped" if final_state == "stopped" else "ended with a fault"
-    cause_text = cause.rstrip(".") or f"the final state is {final_state!r}"
-    end = Check("finished", False, f"The run ended before the goal: {cause_text}.")
-    return Verdict(FAILED, f"The run {word} before the goal.", (end, known))
 
 
 def _motion_time(cycles: CycleTable) -> float:
@@ -239,13 +233,15 @@ def replies(cycles: CycleTable, context: RunContext) -> Check:
     if not lost:
         return Check("lost_replies", True, f"All {asked} replies of the drives arrived.")
     text = f"{lost} of {asked} replies of the drives were lost"
+    shares = (t for t in context.texts_of("reply_lost") if t.startswith(LARGEST_SHARE))
+    share = "".join(f"; {text}" for text in shares)
     if context.texts_of("drive_silent"):
-        return Check("lost_replies", False, f"{text}, and the run was stopped for it.")
+        return Check("lost_replies", False, f"{text}, and the run was stopped for it{share}.")
     if context.course.simulated:
-        return Check("lost_replies", False, f"{text}; simulated drives lose none.")
+        return Check("lost_replies", False, f"{text}; simulated drives lose none{share}.")
     if context.course.final_state in ("finished", "stopped"):  # else a drive may be gone
         text += ", too few to stop the run"
-    return Check("lost_replies", True, f"{text}.")
+    return Check("lost_replies", True, f"{text}{share}.")
 
 
 def tensions(cycles: CycleTable, rig: Rig) -> list[Check]:

@@ -54,6 +54,12 @@ def reply_missing(drive: int, name: str, cycles: int, *, fault: bool) -> Alarm:
     return Alarm(StopReaction.NOTE, "reply_lost", text, drive)
 
 
+def replies_missing(drive: int, name: str, missing: int, cycles: int) -> Alarm:
+    """A drive did not answer in too many of the last cycles, if not in consecutive ones."""
+    text = f"{name} did not answer in {missing} of the last {cycles} cycles"
+    return Alarm(StopReaction.PATH_STOP, "drive_silent", text, drive)
+
+
 def stuck(drive: int, name: str, cycles: int, *, fault: bool) -> Alarm:
     """A drive did not follow its set-points, in the last cycles."""
     text = f"{name} did not move for {_cycles(cycles)} while its set-points advanced"
@@ -116,11 +122,15 @@ def late(cycles: float, *, too_late: bool) -> Alarm:
     return Alarm(reaction, "late", f"a cycle began {cycles:.1f} cycles late")
 
 
+#: Codes of events that name drives which may not hold their cables.
+UNHELD = ("drive_fault", "not_held")
 #: Events of one note, such as the missed set-points of one drive, in a motion: a disturbed bus
 #: would fill the record with more.
 NOTE_EVENTS = 10
 #: End of the text of the last one.
 NO_MORE = "; no more are recorded"
+#: Beginning of the event (`reply_lost`) at the end of a motion with lost replies.
+LARGEST_SHARE = "largest share of lost replies: "
 
 
 class AlarmHistory:

@@ -196,6 +196,27 @@ def test_a_fault_is_failed_and_names_its_cause_even_when_notes_follow(
     assert "cable 4 jammed" in made["reasons"][0]
 
 
+FIRST = "cable 5 (drive 5): over-current; quick stop of all drives, fault latched"
+UNHELD = ["cable 4 (drive 4) restarted", "drives still enabled: cable 3 (drive 3)"]
+
+
+@pytest.mark.parametrize("cause", [FIRST, "; ".join([FIRST, *UNHELD])])
+def test_drives_that_may_not_hold_are_named_besides_the_cause(
+    run: fake_run.FakeRun, cause: str
+) -> None:
+    """Each once, also in the folder of an earlier version, whose cause lacks them."""
+    codes = ("drive_fault", "drive_fault", "not_held")
+    texts = (FIRST, *UNHELD)
+    events = tuple(RunEvent(1.0, *each) for each in zip(codes, texts, strict=True))
+    made = summary(run, final_state="latched", events=events, cause=cause)
+    said = f"Some drives may not hold: {'; '.join(UNHELD)}. "
+    said += "Support the platform and press the emergency stop."
+    assert [c["text"] for c in made["checks"] if c["name"] == "held"] == [said]
+    assert made["reasons"][0].endswith(f"{FIRST}.")
+    alone = summary(run, final_state="latched", events=events[:1], cause=FIRST)
+    assert "held" not in [check["name"] for check in alone["checks"]]
+
+
 def test_a_stopped_run_that_broke_a_limit_is_failed(run: fake_run.FakeRun) -> None:
     near = replace(run, clearance=rows("tag", 5.0, 1.0, 5.0))
     assert summary(near, final_state="stopped")["verdict"] == "FAILED"
@@ -254,6 +275,22 @@ def test_lost_replies_fail_simulated_drives_and_are_reported_on_a_bus(
     check = replies(replace(run.cycles, missing=missing), context)
     assert check.passed is passed
     assert check.text.startswith("2 of ")
+
+
+@pytest.mark.parametrize("end", ["lost", "silent", "simulated"])
+def test_the_drive_with_the_largest_share_of_lost_replies_is_named(
+    run: fake_run.FakeRun, end: str
+) -> None:
+    share = "largest share of lost replies: cable 3 (drive 3), 2 of 300"
+    events = [RunEvent(1.0, "reply_lost", "cable 3 (drive 3) did not answer for 1 cycle")]
+    events += [RunEvent(1.5, "drive_silent", "cable 3 (drive 3): gone")] if end == "silent" else []
+    events += [RunEvent(2.0, "reply_lost", share)]
+    missing = run.cycles.missing.copy()
+    missing[[3, 9]] = 1
+    context = fake_run.changed(run.context, simulated=end == "simulated", events=tuple(events))
+    check = replies(replace(run.cycles, missing=missing), context)
+    assert check.passed is (end == "lost")
+    assert check.text.endswith(f"; {share}.")
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,9 @@ from executor.control.sync_master import (
     ReplyTimeout,
     SyncMaster,
     changed_states,
+    hold_timeout_text,
     late_fault,
+    lost_states,
 )
 from executor.safety.sync_timeout import USUAL_TIMEOUT
 from model.errors import Fault, HardwareMissing
@@ -409,3 +411,34 @@ def test_a_drive_that_is_still_enabled_is_named_even_if_it_was_so_before(
     words = [HELD] * 7
     after = reported([*words, ENABLED], silent)
     assert changed_states(THE_RIG, reported([*words, before]), after, but) == expected
+
+
+@pytest.mark.parametrize(
+    ("before", "silent_before", "silent", "said", "expected"),
+    [
+        (HELD, [], [7], "", "does not answer"),
+        (HELD, [7], [7], "", "does not answer"),
+        (HELD, [7], [7], "cable 8 (drive 8) did not answer", ""),
+        (HELD, [7], [7], "all 8 drives did not answer", ""),
+        (HELD, [], [7], "cable 8 (drive 8): hot", "does not answer"),
+        (ENABLED, [7], [], "", ""),
+        (0x0240, [], [7], "", ""),
+    ],
+    ids=["late", "unnamed", "named", "all named", "held on", "heard again", "never held"],
+)
+def test_after_a_stop_only_drives_that_no_report_names_are_added(
+    before: int, silent_before: list[int], silent: list[int], said: str, expected: str
+) -> None:
+    words = [HELD] * 7
+    earlier = reported([*words, before], silent_before)
+    found = lost_states(THE_RIG, earlier, reported([*words, HELD], silent), ["hot", said])
+    assert found.endswith(expected) if expected else not found
+
+
+def test_a_time_out_names_drives_that_do_not_hold_and_missing_replies() -> None:
+    status = reported([*[HELD] * 6, ENABLED, HELD], [2, 3])
+    assert hold_timeout_text(THE_RIG, status, 3.0) == (
+        "the drives did not hold within 3 s; cable 7 (drive 7) is in operation enabled; no reply"
+        " from cable 3 (drive 3), cable 4 (drive 4) in the last cycle"
+    )
+    assert hold_timeout_text(THE_RIG, None, 3.0) == "the drives did not hold within 3 s"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from drivers.can_bus import SentFrame
-from drivers.cia402.pdo import RPDO1_BASE
+from drivers.cia402.pdo import RPDO1_BASE, TPDO1_BASE
 from drivers.cia402.state_machine import DriveState
 from executor import evaluation as run_module
 from executor.realtime.scheduling import SimulatedClock
@@ -103,8 +103,36 @@ def no_heartbeat(stage: Stage) -> None:
     stage.drives[2]._heartbeat_period = 0.0
 
 
+def lose_replies(stage: Stage, lost: Callable[[int], Collection[int]]) -> None:
+    """Replies of the drives that a function returns for a cycle do not arrive."""
+    watch = stage.group._watch  # type: ignore[attr-defined]
+    take = watch.take
+
+    def takes(can_id: int, *args: Any, **more: Any) -> None:
+        if can_id - TPDO1_BASE - 1 not in lost(stage.cycle):
+            take(can_id, *args, **more)
+
+    watch.take = takes
+
+
+def every_other_reply(*drives: int) -> Callable[[Stage], object]:
+    return lambda stage: lose_replies(stage, lambda cycle: drives if cycle % 2 else ())
+
+
 #: Those that the fault table lacks (`tests.scenarios.faults`), and one that it has.
 CASES = {
+    "a drive loses every other reply": Case(
+        every_other_reply(3),
+        "drive_silent",
+        ("(drive 4) did not answer in 10 of the last 50 cycles; stopped along the path",),
+        within=20,
+    ),
+    "all drives lose every other reply": Case(
+        every_other_reply(*range(8)),
+        "drive_silent",
+        ("all 8 drives did not answer in 10 of the last 50 cycles: bus or supply; stopped along",),
+        within=20,
+    ),
     "a drive reports an emergency and goes on": Case(
         lambda stage: stage.drives[2]._emergency(0x4310),
         "drive_fault",
@@ -138,7 +166,7 @@ CASES = {
     "a drive does not go over to hold": Case(
         lambda stage: setattr(stage.drives[4], "_command_quick_stop", lambda: None),
         "hold_timeout",
-        ("did not hold within",),
+        ("did not hold within 3 s; cable 5 (drive 5) is in operation enabled; quick stop",),
         within=600,
         lost=(4,),
     ),
@@ -215,6 +243,45 @@ def test_a_mere_warning_of_a_drive_ends_no_run(
     assert len(reported) == NOTE_EVENTS
     assert "3280h" in reported[0]
     assert [check["name"] for check in checks].count("drive_warning") == 1
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_the_drive_that_lost_the_most_replies_is_named_with_its_share(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    lost = dict.fromkeys(range(CRUISING, CRUISING + 18, 2), (3,)) | {CRUISING + 30: (3, 5)}
+    lost.pop(CRUISING)  # nine, all others
+
+    def begin(stage: Stage) -> None:
+        lose_replies(stage, lambda cycle: lost.get(cycle, ()))
+
+    with staged(prepared, tmp_path / "run", at(0, begin)) as stage:
+        outcome = stage.run()
+        summary = concluded(stage, outcome)
+    assert outcome.state is State.FINISHED, outcome.cause
+    (check,) = (c for c in summary["checks"] if c["name"] == "lost_replies")
+    share = f"cable 4 (drive 4), 9 of {summary['cycles']}"
+    assert check["text"].endswith(f"; largest share of lost replies: {share}.")
+    last = stage.events()[-1]
+    assert (last.code, last.text) == ("reply_lost", f"largest share of lost replies: {share}")
+
+
+@pytest.mark.usefixtures("no_pictures")
+def test_drives_that_said_they_hold_need_not_answer_in_the_same_cycle(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """Two drives lost replies in turn: the run waited 3 s and latched a fault, but all held."""
+
+    def in_turn(stage: Stage) -> None:
+        lose_replies(
+            stage,
+            lambda cycle: (2 + cycle % 2,) if stage.recorder.state is State.SECURING else (),  # type: ignore[union-attr]
+        )
+
+    with staged(prepared, tmp_path / "run", at(0, in_turn)) as stage:
+        outcome = stage.run()
+    assert "hold_timeout" not in [event.code for event in stage.events()]
+    assert outcome.log.table().time[-1] < 5.0, outcome.cause
 
 
 @pytest.mark.usefixtures("no_pictures")

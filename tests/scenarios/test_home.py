@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.can_errors import BusDown
+from drivers.cia402.pdo import TPDO1_BASE
 from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup, GroupState
 from drivers.factory import make_drive_group, read_drives
@@ -329,6 +330,22 @@ def starts_again(bench: Bench) -> None:
 
 def fails(bench: Bench) -> None:
     bench.rehearsal.drives[6].fail(0x2310)
+
+
+def test_a_drive_that_loses_every_other_reply_ends_the_motion() -> None:
+    with after_power_loss(lost(1, on_a_stand=True)) as bench:
+        take, cycles = bench.group._watch.take, bench.records  # type: ignore[attr-defined]
+
+        def takes(can_id: int, *args: Any, **more: Any) -> None:
+            if can_id != TPDO1_BASE + 3 or len(cycles) < 80 or len(cycles) % 2:
+                take(can_id, *args, **more)
+
+        bench.group._watch.take = takes  # type: ignore[attr-defined]
+        result = bench.take_up()
+        assert result.state is State.LATCHED
+        said = "cable 3 (drive 3) did not answer in 10 of the last 50 cycles; stopped together"
+        assert result.cause == said
+        assert bench.states == {DriveState.QUICK_STOP_ACTIVE}
 
 
 @pytest.mark.parametrize("happens", [falls_silent, loses_all_torque, starts_again, fails])

@@ -23,7 +23,7 @@ from model.errors import Fault, Refused
 from model.rig import rig_from_document
 from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.program import call
-from tests.scenarios.stage import Stage, at, staged
+from tests.scenarios.stage import Stage, at, concluded, staged
 from tests.scenarios.test_bus_faults import LOST_BY_CONTROLLER, PASSIVE, PROTOCOL_ERROR
 from tests.scenarios.test_real_time import drives_on
 
@@ -339,10 +339,63 @@ def test_a_drive_that_nothing_stops_is_reported_as_still_enabled(
         events = stage.events()
         assert stage.drives[FIFTH].state is DriveState.OPERATION_ENABLED
     assert outcome.state is State.LATCHED
-    assert events[-1].code == "not_held"
-    assert "still enabled: cable 5 (drive 5)" in events[-1].text
-    assert "drive 4" not in events[-1].text
-    assert "drive 6" not in events[-1].text, "its silence is the cause"
+    (event,) = (each for each in events if each.code == "not_held")
+    assert "still enabled: cable 5 (drive 5)" in event.text
+    assert "drive 4" not in event.text
+    assert ("drive 6" in outcome.cause) is also_dead
+
+
+def welded(stage: Stage) -> None:
+    """Drive 5 fails; drive 6 takes no stop, by whichever path."""
+    if stage.cycle == CRUISING:
+        stage.drives[FIFTH].fail(0x2310)
+        stuck = stage.drives[SIXTH]
+        stuck._take_control_word = lambda _word: None  # type: ignore[method-assign]
+        stuck._connection_lost = lambda _code: None  # type: ignore[method-assign]
+
+
+def also_fails(stage: Stage) -> None:
+    if stage.cycle in (CRUISING, CRUISING + 3):
+        stage.drives[FIFTH if stage.cycle == CRUISING else SIXTH].fail(0x2310)
+
+
+def both_fail(stage: Stage) -> None:
+    if stage.cycle == CRUISING:
+        stage.drives[FIFTH].fail(0x2310)
+        stage.drives[SIXTH].fail(0x3210)
+
+
+def also_dies(stage: Stage) -> None:
+    if stage.cycle == CRUISING:
+        stage.drives[FIFTH].fail(0x2310)
+    if stage.cycle == CRUISING + 3:
+        loses_power(stage.drives[SIXTH])
+
+
+@pytest.mark.parametrize(
+    ("happens", "words"),
+    [
+        (welded, "drives still enabled: cable 6 (drive 6)"),
+        (also_fails, "cable 6 (drive 6)"),
+        (both_fail, "cable 6 (drive 6)"),
+        (also_dies, "cable 6 (drive 6) does not answer"),
+    ],
+)
+def test_a_second_drive_that_does_not_hold_is_named_with_what_to_do(
+    prepared: PreparedRun, tmp_path: Path, happens: Callable[[Stage], None], words: str
+) -> None:
+    """The first cause alone says "quick stop of all drives": not true of this one."""
+    with staged(prepared, tmp_path / "run", happens) as stage:
+        outcome = stage.run()
+        summary = concluded(stage, outcome)
+    assert outcome.cause.startswith("cable 5 (drive 5)")
+    assert words in outcome.cause.partition("fault latched")[2], "the latch keeps it"
+    first, *others = summary["reasons"]
+    assert words not in first, "each is stated once"
+    (second,) = (reason for reason in others if words in reason)
+    assert second.endswith("Support the platform and press the emergency stop.")
+    (check,) = (check for check in summary["checks"] if check["name"] == "held")
+    assert check["text"] == second
 
 
 THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")

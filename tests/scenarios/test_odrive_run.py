@@ -217,6 +217,22 @@ CASES = {
 }
 
 
+def test_a_drive_whose_position_is_often_overdue_ends_the_run_along_the_path(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    """It sends one in every third cycle, and may be a cycle late: it is overdue in one of three."""
+
+    def rarely(stage: Any) -> None:
+        is_due = stage.cycle < CRUISING or stage.cycle % 3 == 0
+        stage.drives[2].silent = set() if is_due else {"estimates"}
+
+    with staged(prepared, tmp_path / "run", rarely) as (stage, _):
+        outcome = stage.run()
+    assert outcome.state is State.LATCHED
+    said = "cable 3 (drive 3) did not answer in 10 of the last 50 cycles; stopped along the path"
+    assert outcome.cause == said
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_fault_of_one_drive_is_a_hold_of_all_and_then_their_brakes(
     prepared: PreparedRun, tmp_path: Path, name: str

@@ -9,6 +9,7 @@ from executor.safety.fault_messages import (
     AlarmHistory,
     StopReaction,
     drive_warning,
+    replies_missing,
     shared_causes,
     slack,
     stuck,
@@ -39,6 +40,13 @@ def test_all_drives_that_fall_silent_at_once_are_one_cause() -> None:
     )
     (note,) = shared_causes(silent(*range(1, 9), cycles=1), NAMES)
     assert note.text == "all 8 drives did not answer for 1 cycle: bus or supply"
+
+
+def test_drives_that_often_do_not_answer_are_one_cause_too() -> None:
+    missed = [replies_missing(k, NAMES[k - 1], 10, 50) for k in range(1, 9)]
+    (alarm,) = shared_causes(missed, NAMES)
+    assert alarm.text == "all 8 drives did not answer in 10 of the last 50 cycles: bus or supply"
+    assert (alarm.code, alarm.reaction) == ("drive_silent", StopReaction.PATH_STOP)
 
 
 def test_some_drives_are_named_and_one_keeps_its_own_text() -> None:

@@ -9,7 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from executor.safety.fault_messages import Alarm, StopReaction
-from executor.safety.monitor import Monitor, MonitorLimits, Observation
+from executor.safety.monitor import (
+    LOST_REPLIES,
+    REPLY_WINDOW,
+    Monitor,
+    MonitorLimits,
+    Observation,
+    ReplyCounts,
+)
 
 NAN = float("nan")
 LIMITS = MonitorLimits(following_error=0.002, min_tension=5.0, max_tension=100.0, no_tension=0.5)
@@ -57,6 +64,7 @@ def test_limits_have_the_values_of_the_stop_rules():
     assert (LIMITS.slack_cycles, LIMITS.missing_cycles, LIMITS.late_periods) == (5, 2, 1.0)
     assert LIMITS.gone_periods == 1.5
     assert LIMITS.loose_cycles == 3
+    assert (LIMITS.lost_replies, REPLY_WINDOW) == (LOST_REPLIES, 50) == (10, 50)
 
 
 def test_one_lost_reply_is_noted_and_two_in_a_row_stop():
@@ -92,6 +100,82 @@ def test_a_watch_may_be_set_to_wait_longer_for_replies():
         found.append(alarm)
     assert [f.reaction for f in found] == [StopReaction.NOTE] * 3 + [StopReaction.QUICK_STOP] * 2
     assert [f.text.split(" for ")[1] for f in found[:2]] == ["1 cycle", "2 cycles"]
+
+
+def losing(drive: int, *gaps: int) -> list[Observation]:
+    """Each gap is a number of cycles with all replies, before one without that of a drive."""
+    lost = _with("missing", drive, True)
+    return [seen for gap in gaps for seen in (*[FINE] * gap, lost)]
+
+
+@each_drive
+def test_every_tenth_lost_reply_of_fifty_stops_along_the_path(drive: int) -> None:
+    nine, ten = losing(drive, *[1] * 9), losing(drive, *[1] * 10)
+    assert _codes(*nine) == [("reply_lost", StopReaction.NOTE)]
+    assert _codes(*nine, *[FINE] * 60) == []
+    text = f"{NAMES[drive]} did not answer in 10 of the last 20 cycles"
+    stop = Alarm(StopReaction.PATH_STOP, "drive_silent", text, drive + 1)
+    assert _look(*ten) == (stop,)
+    (later,) = _look(*ten, *[FINE] * 30)
+    assert later.text.endswith("10 of the last 50 cycles"), "also in cycles with its reply"
+    assert _look(*ten, *[FINE] * 31) == (later,)
+    assert _look(*ten, *[FINE] * 32) == ()
+
+
+def test_lost_replies_count_in_a_window_of_fifty_cycles() -> None:
+    assert _codes(*losing(0, 0, *[1] * 8, 32)) == [("drive_silent", StopReaction.PATH_STOP)]
+    assert _codes(*losing(0, 0, *[1] * 8, 33)) == [("reply_lost", StopReaction.NOTE)]
+
+
+def test_lost_replies_of_two_drives_do_not_add_up() -> None:
+    cycles = [seen for _ in range(9) for seen in (*losing(0, 1), *losing(1, 1))]
+    assert [code for code, _ in _codes(*cycles)] == ["reply_lost"]
+
+
+def test_replies_lost_in_a_row_remain_a_quick_stop_after_many_lost_ones() -> None:
+    lost = _with("missing", 1, True)
+    assert _codes(*losing(1, *[1] * 10), lost) == [("drive_silent", StopReaction.QUICK_STOP)]
+
+
+def test_a_watch_may_be_set_to_allow_more_lost_replies() -> None:
+    watch, found = Monitor.fresh(replace(LIMITS, lost_replies=12), NAMES), []
+    for seen in losing(2, *[1] * 12):
+        watch, alarms = watch.update(seen)
+        found += [alarm.reaction for alarm in alarms]
+    assert found == [StopReaction.NOTE] * 11 + [StopReaction.PATH_STOP]
+
+
+def counted(*cycles: tuple[bool, ...]) -> ReplyCounts:
+    counts = ReplyCounts(0, (0, 0, 0), (0, 0, 0))
+    for missing in cycles:
+        counts = counts.seen(missing)
+    return counts
+
+
+def test_the_drive_with_the_largest_share_of_lost_replies_is_named() -> None:
+    first, second = (True, False, False), (False, True, False)
+    begin = "largest share of lost replies: "
+    assert counted().largest_share(NAMES) == ""
+    assert counted((False,) * 3).largest_share(NAMES) == ""
+    assert counted(first, second, second).largest_share(NAMES) == f"{begin}{NAMES[1]}, 2 of 3"
+    both = f"{begin}{NAMES[0]}, {NAMES[1]}, 1 of 2 each"
+    assert counted(first, second).largest_share(NAMES) == both
+    assert counted((True,) * 3).largest_share(NAMES) == f"{begin}all 3 drives, 1 of 1 each"
+
+
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), max_size=120))
+def test_lost_replies_are_counted_in_all_and_in_the_last_cycles(
+    cycles: list[tuple[bool, bool, bool]],
+) -> None:
+    counts = counted(*cycles)
+    assert counts.cycles == len(cycles)
+    assert counts.lost == tuple(sum(row[d] for row in cycles) for d in range(3))
+    assert counts.lost_lately == tuple(sum(row[d] for row in cycles[-50:]) for d in range(3))
+
+
+def test_counts_of_another_number_of_drives_are_an_error() -> None:
+    with pytest.raises(ValueError, match="zip"):
+        counted((True, False))
 
 
 def test_every_fault_that_drives_report_stops_at_once():
@@ -291,11 +375,12 @@ def test_an_observation_of_another_number_of_drives_is_an_error(field, count):
 def test_counts_are_runs_of_what_was_seen(cycles):
     """Against counting by hand, for one drive."""
     watch = Monitor.fresh(LIMITS, NAMES[:1])
-    missing = slack = loose = over = 0
+    missing = slack = loose = over = lost_ones = 0
     for following, tension, lost in cycles:
         seen = Observation(following, (0.0,), (tension,), (lost,), (), 0.0)
         watch, found = watch.update(seen)
         missing = missing + 1 if lost else 0
+        lost_ones += lost
         if not lost:
             slack = slack + 1 if following and tension < 5.0 else 0
             loose = loose + 1 if following and tension < 0.5 else 0
@@ -303,8 +388,8 @@ def test_counts_are_runs_of_what_was_seen(cycles):
         assert (watch.missing, watch.slack) == ((missing,), (slack,))
         assert (watch.loose, watch.over) == ((loose,), (over,))
         wanted = {
-            "drive_silent": missing >= 2,
-            "reply_lost": missing == 1,
+            "drive_silent": missing >= 2 or lost_ones >= 10,
+            "reply_lost": missing == 1 and lost_ones < 10,
             "slack": slack >= 5 and loose < 3,
             "cable_loose": loose >= 3,
             "over_tension": over >= 5,

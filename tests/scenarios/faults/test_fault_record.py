@@ -17,7 +17,7 @@ from simulation.fault_bus import lose_next
 from tests.scenarios.faults.bench import Script, once, simulated
 from tests.scenarios.faults.cases import TABLE, incoming, late
 from tests.scenarios.stage import concluded
-from tests.scenarios.test_faults import jump_in_table, overload
+from tests.scenarios.test_faults import jump_in_table
 
 #: Distance of drives at rest from their last set-points, [counts].
 FOLLOWED = 12
@@ -110,7 +110,7 @@ def test_a_drive_without_torque_measures_no_tension(prepared: PreparedRun, tmp_p
 def test_after_a_path_stop_for_a_fault_tensions_are_known_to_the_end(
     prepared: PreparedRun, tmp_path: Path
 ) -> None:
-    script = once(lambda bench: overload(bench.stage))
+    script = TABLE["F18 a cable is overloaded"].script()
     cycles, summary, state = recorded(prepared, tmp_path / "run", script)
     assert state is State.LATCHED
     assert cycles.state[-1] == State.SECURING.value
