@@ -1,9 +1,9 @@
 """A simulated ODrive, based on CANSimple, independent of the master.
 
 It sends heartbeats, estimates and torques periodically. A set-point takes effect on arrival. When
-the axis is armed, its brake begins to open; until it is open the motor neither moves nor carries the
-cable. When it is disarmed, by the master, its watchdog or an error, the torque is removed and the
-brake closes.
+the axis is armed, its brake begins to open; until it is open the motor neither moves nor carries
+the cable. When it is disarmed, by the master, its watchdog or an error, the torque is removed and
+the brake closes.
 
 Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Assumptions where it is not specific:
 the watchdog runs while the axis is enabled (`OdriveSettings.watchdog_at_rest` changes that); every
