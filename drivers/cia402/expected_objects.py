@@ -329,10 +329,10 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
     """
     if setting.per_mille_of is not None:
         index, sub = setting.per_mille_of
-        if not any(network.client(node).read(index, sub, "rated value")):
-            name = f"{object_name(index, sub)} rated value"
-            why = f"{setting} is a share of it: the drive would have no torque"
-            raise wrong_value(node, name, "0", "the motor's data", why)
+        rated = int.from_bytes(network.client(node).read(index, sub, "rated value"), "little")
+        if misfit := setting.misfit_of(rated):
+            name, why = f"{object_name(index, sub)} rated value", f"{setting} is a share of it"
+            raise wrong_value(node, name, str(rated), "the motor's", f"{why}; {misfit}")
     if setting.optional or setting.transient:
         return
     try:

@@ -264,8 +264,8 @@ class _Reader:
             return
         count = int.from_bytes(data, "little")
         if used and count < 1:
-            change = "a drive that cannot monitor its master is not safe to run"
-            row.note(self._node, "0", "wrong", change)
+            lacks = how_without(self._profile, HEARTBEAT_CONSUMERS, 0, self._client.read_if_there)
+            row.note(self._node, "0", "wrong", lacks)
         elif used and self._profile.usable_heartbeats(count) < drives:
             row.note(self._node, str(count), "remark", "none required: not every peer is monitored")
         else:
@@ -323,8 +323,8 @@ class _Reader:
             found = self._read(*setting.per_mille_of, rated, optional=False)
             if found is not None:
                 value = int.from_bytes(found, "little")
-                change = "" if value else "enter the motor data with the manufacturer's tool"
-                rated.note(self._node, str(value), "ok" if value else "wrong", change)
+                misfit = setting.misfit_of(value)
+                rated.note(self._node, str(value), "wrong" if misfit else "ok", misfit)
 
     def at_absent(self, setting: Setting) -> None:
         """An object that the profile declares absent; if it exists, its value is checked."""

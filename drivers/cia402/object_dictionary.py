@@ -6,10 +6,11 @@ import math
 import struct
 from dataclasses import dataclass, replace
 
-from drivers.can_load import HEARTBEATS_WAITED, heartbeat_cycles, heartbeat_timeout
+from drivers.can_load import HEARTBEATS_WAITED, heartbeat_timeout
 from drivers.cia402.pdo import MASTER_NODE, RPDO1_BASE, TPDO1_BASE
 from drivers.cia402.profile import (
     interpolation_time,
+    produced_ms,
     profile_of,
     quick_stop_ramp,
     quick_stop_time,
@@ -38,6 +39,8 @@ TORQUE_RESERVE = 1.2
 LOWEST, HIGHEST = 0.99, 1.1
 """Share of a ramp that a drive may keep where it rounds to its own steps: hardly less steep."""
 
+_CHECK_RIG = "check the winches, the cycle and the drive profile of the rig file"
+_CHECK_LIMIT = "check `bytes` and the value at rated torque in torque_limit of the drive profile"
 _UNSIGNED_MAX = {"<B": 0xFF, "<H": 0xFFFF, "<I": 0xFFFFFFFF}
 
 
@@ -89,7 +92,7 @@ class Setting:
                 f"{self} cannot hold {self.value}",
                 where="configuring the drives",
                 why=self.why,
-                next_step="check the winches, the cycle and the drive profile of the rig file",
+                next_step=_CHECK_LIMIT if self.name == CURRENT_LIMIT else _CHECK_RIG,
             ) from None
 
     @property
@@ -110,6 +113,14 @@ class Setting:
     def of_rated(self, rated: float) -> Setting:
         """The setting in the unit of ``rated``, the value at rated torque, not in per mille."""
         return replace(self, value=math.ceil(self.value * rated / 1000.0), per_mille_of=None)
+
+    def misfit_of(self, rated: float) -> str:
+        """Why the limit cannot be a share of ``rated``, and what to do; empty if it can."""
+        if not rated:
+            return "no torque would be left: enter the motor data with the manufacturer's tool"
+        value = self.of_rated(rated).value
+        fits = value <= _UNSIGNED_MAX[self.form]
+        return "" if fits else f"its {self.size} bytes cannot hold {value}: {_CHECK_LIMIT}"
 
     def text(self, value: int) -> str:
         """A value as text; identifiers, mappings and 1016h in hexadecimal, as in manuals."""
@@ -259,7 +270,7 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
 
 def peer_timeout_ms(rig: Rig) -> int:
     """Time without a heartbeat of a drive after which others that monitor it stop, [ms]."""
-    produced = HEARTBEATS_WAITED * _produced_ms(rig.cycle, profile_of(rig))
+    produced = HEARTBEATS_WAITED * produced_ms(rig.cycle, profile_of(rig))
     return math.ceil(max(1000 * heartbeat_timeout(rig.cycle), produced))
 
 
@@ -316,8 +327,8 @@ def _supervision(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
     if profile.monitoring == "heartbeat" and profile.communication_cycle_period:
         why = "the drive synchronises to it; the heartbeat stops the drive"
     elif profile.monitoring == "heartbeat":
-        period_us, why = 0, "unused (communication_cycle_period): the heartbeat stops the drive"
-    produced_ms = _produced_ms(cycle, profile)
+        key = " (communication_cycle_period)" if profile.has(0x1006, 0) else ""
+        period_us, why = 0, f"unused{key}: the heartbeat stops the drive"
     return (
         Setting(0x1006, 0, "<I", period_us, "communication cycle period", why),
         Setting(
@@ -326,7 +337,8 @@ def _supervision(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
             instead="a drive without it has no window",
         ),
         Setting(
-            0x1017, 0, "<H", produced_ms, "producer heartbeat time", "peers monitor each other"
+            *(0x1017, 0, "<H", produced_ms(cycle, profile)),
+            *("producer heartbeat time", "peers monitor each other"),
         ),
         Setting(
             *(0x1029, 1, "<B", 1, "communication error behaviour", "keep reporting"),
@@ -334,15 +346,6 @@ def _supervision(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
             instead="a drive may leave NMT operational, which is a fault",
         ),
     )
-
-
-def _produced_ms(cycle: float, profile: ProfileDocument) -> int:
-    """Period of a drive's heartbeat, [ms]: the master's, or the drive's shortest.
-
-    Only other drives monitor it; the master gets a reply every cycle.
-    """
-    shortest = profile.range_of(0x1017, 0)
-    return max(round(1000 * cycle * heartbeat_cycles(cycle)), shortest.low if shortest else 0)
 
 
 def _mode(cycle: float, profile: ProfileDocument) -> tuple[Setting, ...]:
@@ -436,7 +439,10 @@ def _torque_limits(per_mille: int, profile: ProfileDocument) -> tuple[Setting, .
     rated = None if limit.rated is None else object_key(limit.rated)
     where, form = object_key(limit.object), "<H" if limit.bytes == 2 else "<I"
     setting = Setting(*where, form, per_mille, CURRENT_LIMIT, why, per_mille_of=rated)
-    return standard, setting.of_rated(limit.rated_value) if limit.rated_value else setting
+    if limit.rated_value is not None:
+        setting = setting.of_rated(limit.rated_value)
+        setting.data()  # refused before anything is written
+    return standard, setting
 
 
 def _capped(index: int, name: str, value: float, why: str) -> Setting:

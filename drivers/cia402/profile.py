@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+from drivers.can_load import heartbeat_cycles
 from drivers.cia402.state_machine import POWER_BITS, REMOTE
 from model.errors import BadInput, Refused
 from model.files.documents import load_yaml
@@ -209,6 +210,15 @@ def interpolation_time(
     )
 
 
+def produced_ms(cycle: float, profile: ProfileDocument) -> int:
+    """Period of a drive's heartbeat, [ms]: the master's, or the drive's shortest.
+
+    Only other drives monitor it; the master gets a reply every cycle.
+    """
+    shortest = profile.range_of(0x1017, 0)
+    return max(round(1000 * cycle * heartbeat_cycles(cycle)), shortest.low if shortest else 0)
+
+
 def quick_stop_ramp(rig: Rig, drive: int, cycle: float, profile: ProfileDocument) -> float:
     """Deceleration that stops a drive from top speed within a cycle, in the drive's unit."""
     winch = rig.winches[drive]
@@ -277,7 +287,9 @@ def _is_unmonitored(
     else:
         return False
     try:
-        return unusable or read(object_key(other)[0], 0, OBJECTS[other]) is None
+        data = read(object_key(other)[0], 0, OBJECTS[other])
+        without_entries = other == "1016h:01" and not any(data or b"")
+        return unusable or data is None or without_entries
     except Refused as error:  # it may have the object
         if "abort_code" not in error.values:
             raise

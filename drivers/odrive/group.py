@@ -305,7 +305,7 @@ class OdriveGroup(CyclicGroup):
             if self._all_disarmed() or self._waited > self._patience:
                 self._stop = _Stop.OVER
         elif self._state is GroupState.ENABLING:
-            if self._watch.measures_tensions:  # those of idle axes are no cable's tension
+            if self._watch.measures_tensions:  # until then brakes carry the cables
                 self._state = GroupState.ENABLED
             elif self._waited > self._patience:
                 self._latch(self._not_enabled())

@@ -29,8 +29,9 @@ MISSED_TORQUES = 3
 positions."""
 
 TORQUE_AFTER = 2
-"""Cycles after which a torque is younger than the heartbeat that showed its drive under torque: the
-drive measures and sends it by its own clock, and a cycle may end between two of its messages."""
+"""Cycles after which a torque is younger than the heartbeat that showed its drive under torque, or
+than the opening of its brake: the drive measures and sends it by its own clock, and a cycle may end
+between two of its messages."""
 
 NEVER = 10**6
 
@@ -91,6 +92,8 @@ class OdriveMonitor:
         }
         self._ages = {report: [NEVER] * count for report in self._most}
         self._under_torque = [0] * count  # cycles since each drive was seen so
+        opening = document.brake_opens_ms if any(winch.brake for winch in rig.winches) else 0.0
+        self._torque_after = TORQUE_AFTER + math.ceil(opening / cycle_ms)
         self._not_numbers: set[tuple[Report, int]] = set()
         self._routes: dict[int, tuple[int, Layout, Callable[[int, tuple[float, ...]], None]]] = {}
         for drive, node in enumerate(self.nodes):
@@ -123,9 +126,13 @@ class OdriveMonitor:
 
     @property
     def measures_tensions(self) -> bool:
-        """Whether every axis follows set-points and has sent a torque since."""
+        """Whether every axis is under torque, and has sent one since its brake must be open.
+
+        An axis counts as armed as soon as its brake begins to open; until then the brake carries
+        the cable, not the motor.
+        """
         ages = zip(self._ages["torque"], self._under_torque, strict=True)
-        return all(age + TORQUE_AFTER <= cycles for age, cycles in ages)
+        return all(age + self._torque_after <= cycles for age, cycles in ages)
 
     @property
     def status_words(self) -> list[int]:

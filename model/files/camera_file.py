@@ -11,13 +11,14 @@ from model.files.documents import (
     WHOLE_LARGEST,
     AnyNumber,
     Document,
+    Finding,
     Name,
     NonNegative,
     Number,
     PoseDocument,
     Positive,
 )
-from model.tag_families import TagFamily
+from model.tag_families import TagFamily, tags_in
 
 #: Tag detectors: OpenCV, or pyapriltags from the extra `apriltag`.
 TagDetectorName = Literal["opencv", "apriltag"]
@@ -107,6 +108,20 @@ class TagsDocument(Document):
         default=None,
         description="position error of the platform's tag corners, 95 %; calibrations write it",
     )
+
+    def ids(self) -> list[tuple[tuple[str | int, ...], int]]:
+        """Number of every tag, with its key in the rig file."""
+        return [
+            (("tags", group, i, "id"), tag.id)
+            for group, tags in (("platform", self.platform), ("frame", self.frame))
+            for i, tag in enumerate(tags)
+        ]
+
+    def misfits(self) -> list[Finding]:
+        """Tags that the family does not have."""
+        count = tags_in(self.family)
+        what = f"{self.family} has the tags 0 to {count - 1}"
+        return [(key, what) for key, number in self.ids() if number >= count]
 
 
 class CameraDocument(Document):

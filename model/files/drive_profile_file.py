@@ -56,6 +56,9 @@ NEEDED = (
 _RATED_SHARE = "6073h:00"
 """Max current, in per mille of the rated current. Source: CiA 402-2."""
 
+FINEST_RATED = 10.0
+"""Smallest value of a current limit at rated torque: it is rounded up, by less than 10 % of it."""
+
 _PROCESS_DATA = "rpdo and tpdo"
 _CYCLE = "bus.cycle_ms of the rig file"
 
@@ -94,6 +97,15 @@ def _is_known(text: str) -> str:
     return text
 
 
+def _is_fine(rated: float) -> float:
+    if rated < FINEST_RATED:
+        raise ValueError(
+            f"must be {FINEST_RATED:g} or more, else the limit's unit is too coarse; it is"
+            f" {rated:g}"
+        )
+    return rated
+
+
 def _is_code(text: str) -> str:
     if not _CODE.fullmatch(text):
         raise ValueError(f"must be an error code such as 3180h or 33xxh; it is {text!r}")
@@ -111,6 +123,9 @@ MissingObject = Annotated[
     str, AfterValidator(_is_known), _in_schema(enum=[key for key in OBJECTS if key not in NEEDED])
 ]
 CodePattern = Annotated[str, AfterValidator(_is_code), _in_schema(pattern=f"^{_CODE.pattern}$")]
+RatedValue = Annotated[
+    float, Field(le=1e9), AfterValidator(_is_fine), _in_schema(minimum=FINEST_RATED)
+]
 Text = Annotated[str, Field(min_length=1)]
 
 
@@ -149,7 +164,7 @@ class TorqueLimit(Document):
         description="the object with the current at rated torque, in the same unit; it and"
         f" rated_value left out, which only {_RATED_SHARE} allows, the limit is in per mille of it",
     )
-    rated_value: Annotated[float, Field(gt=0.0, le=1e9)] | None = Field(
+    rated_value: RatedValue | None = Field(
         default=None,
         description="value of the limit at rated torque, where no object holds it",
     )
@@ -284,11 +299,21 @@ class ProfileDocument(Document):
         return []
 
     def _torque(self) -> list[Finding]:
-        absent = "6072h:00" in self.absent
-        if absent == (self.torque_limit is not None):
+        absent, limit = "6072h:00" in self.absent, self.torque_limit
+        if absent != (limit is not None):
+            what = "torque_limit is needed where 6072h:00 is absent, and only there"
+            return [(("absent",) if absent else ("torque_limit",), what)]
+        if limit is None:
             return []
-        what = "torque_limit is needed where 6072h:00 is absent, and only there"
-        return [(("absent",) if absent else ("torque_limit",), what)]
+        named = (
+            ("object", limit.object, "that limits the current"),
+            ("rated", limit.rated, "that holds the current at rated torque"),
+        )
+        return [
+            (("torque_limit", key), f"this program writes {name} itself: name the object {which}")
+            for key, name, which in named
+            if name and (self._keys_for(name) or (key == "rated" and name == limit.object))
+        ]
 
     def _needed(self) -> list[Finding]:
         return [
@@ -301,17 +326,23 @@ class ProfileDocument(Document):
         return [
             (
                 ("expect", number, "object"),
-                f"this program writes {each.object} itself: use {keys} instead",
+                f"{each.object} is in absent: a drive that has it needs the value of this program"
+                if each.object in self.absent
+                else f"this program writes {each.object} itself: use {keys} instead",
             )
             for number, each in enumerate(self.expect)
-            if (keys := self._keys_for(each.object))
+            if (keys := self._keys_with_limit(each.object))
         ]
 
-    def _keys_for(self, name: str) -> str:
-        """The keys that control an object that is written; empty if it is not."""
-        index, sub = object_key(name)
+    def _keys_with_limit(self, name: str) -> str:
+        """As `_keys_for`, of the current limit too."""
         if self.torque_limit is not None and name == self.torque_limit.object:
             return f"torque_limit and {_DETERMINED_BY[0x6072]}"
+        return self._keys_for(name)
+
+    def _keys_for(self, name: str) -> str:
+        """The keys that control an object that is written in all makes; empty if it is not."""
+        index, sub = object_key(name)
         if 0x1400 <= index < 0x1C00:
             return _PROCESS_DATA if self._maps(index, sub) else ""
         if index == 0x1016:

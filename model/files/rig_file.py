@@ -22,7 +22,6 @@ from model.files.documents import (
     Vector,
 )
 from model.files.simulation_file import SimulationDocument
-from model.tag_families import tags_in
 
 # The drives of the winches.
 
@@ -75,6 +74,11 @@ class OdriveDocument(Document):
     heartbeat_ms: Period = Field(default=100, description="axis0.config.can.heartbeat_msg_rate_ms")
     estimates_ms: Period = Field(default=10, description="axis0.config.can.encoder_msg_rate_ms")
     torques_ms: Period = Field(default=10, description="axis0.config.can.torques_msg_rate_ms")
+    brake_opens_ms: Annotated[float, Field(ge=0, le=1000)] = Field(
+        default=150.0,
+        description="longest time from arming a drive until its brake is open; no drive counts as"
+        " enabled before; not used where no winch has a brake",
+    )
     dbc: FileName | None = Field(
         default=None,
         description="ODrive's own DBC file of the firmware; left out: the one of cdpr",
@@ -359,24 +363,10 @@ class RigDocument(Document):
         ]
 
     def _tags_once(self) -> list[Finding]:
-        return _repeated("tag id", self._tag_ids())
+        return [] if self.tags is None else _repeated("tag id", self.tags.ids())
 
     def _tags_of_the_family(self) -> list[Finding]:
-        if self.tags is None:
-            return []
-        count = tags_in(self.tags.family)
-        what = f"{self.tags.family} has the tags 0 to {count - 1}"
-        return [(key, what) for key, number in self._tag_ids() if number >= count]
-
-    def _tag_ids(self) -> list[tuple[tuple[str | int, ...], int]]:
-        if self.tags is None:
-            return []
-        groups = {"platform": self.tags.platform, "frame": self.tags.frame}
-        return [
-            (("tags", group, i, "id"), tag.id)
-            for group, tags in groups.items()
-            for i, tag in enumerate(tags)
-        ]
+        return [] if self.tags is None else self.tags.misfits()
 
     def _cameras_once(self) -> list[Finding]:
         names = [(("cameras", i, "name"), camera.name) for i, camera in enumerate(self.cameras)]

@@ -1,8 +1,9 @@
 """A simulated ODrive, based on CANSimple, independent of the master.
 
 It sends heartbeats, estimates and torques periodically. A set-point takes effect on arrival. When
-the axis is disarmed, by the master, its watchdog or an error, the torque is removed and the brake
-closes.
+the axis is armed, its brake begins to open; until it is open the motor neither moves nor carries
+the cable. When it is disarmed, by the master, its watchdog or an error, the torque is removed and
+the brake closes.
 
 Source: ODrive documentation, "CAN Protocol" (firmware 0.6). Assumptions where it is not specific:
 the watchdog runs while the axis is enabled (`OdriveSettings.watchdog_at_rest` changes that); every
@@ -66,6 +67,7 @@ class OdriveSettings:
         heartbeat: Period, [s].
         estimates: Period, [s].
         torques: Period, [s].
+        brake_opens: Time from arming the axis until its brake is open, [s].
         watchdog_at_rest: The watchdog also runs while the axis is idle, as in firmware 0.5.
         fed_by_reads: Every frame feeds the watchdog; otherwise only set-points and states do.
         firmware: Major, minor, revision.
@@ -78,6 +80,7 @@ class OdriveSettings:
     heartbeat: float
     estimates: float
     torques: float
+    brake_opens: float
     watchdog_at_rest: bool = False
     fed_by_reads: bool = True
     firmware: tuple[int, int, int] = (0, 6, 11)
@@ -153,15 +156,20 @@ class SimulatedOdrive:
         self.state, self.errors, self.result = AxisState.IDLE, 0, SUCCESS
         self._mode: tuple[int, int] = (0, 0)
         self._target = self.motor.position
-        self._unfed = 0.0
+        self._unfed = self._opening = 0.0
         self._largest_torque = float("inf")
         self.motor.top_speed = self._top_speed
         self.motor.release()
 
     @property
+    def armed(self) -> bool:
+        """The axis controls its motor; its brake is open, or opening."""
+        return self.state is AxisState.CLOSED_LOOP_CONTROL
+
+    @property
     def torque_on(self) -> bool:
         """The motor holds or moves the cable; otherwise the brake does."""
-        return self.state is AxisState.CLOSED_LOOP_CONTROL
+        return self.armed and self._opening <= 1e-9
 
     def advance(self, elapsed: float) -> None:
         """Advances time, [s]: the motor moves, the watchdog runs, messages are sent."""
@@ -169,7 +177,8 @@ class SimulatedOdrive:
             return
         if self.torque_on:
             self.motor.follow(self._target, 0.0, elapsed, self._limited_direction())
-        if self.torque_on or self.settings.watchdog_at_rest:
+        self._opening -= min(elapsed, self._opening)
+        if self.armed or self.settings.watchdog_at_rest:
             self._unfed += elapsed
             watchdog = self.settings.watchdog
             if watchdog is not None and self._unfed > watchdog + 1e-9:
@@ -215,13 +224,14 @@ class SimulatedOdrive:
         self._unfed = 0.0
         if wanted == AxisState.IDLE:
             self._disarm(SUCCESS)
-        elif wanted == AxisState.CLOSED_LOOP_CONTROL and not self.torque_on:
+        elif wanted == AxisState.CLOSED_LOOP_CONTROL and not self.armed:
             position_control = self._mode == (ControlMode.POSITION, InputMode.PASSTHROUGH)
             if self.errors or not self.calibrated or not position_control:
                 self.result = DISARMED if self.errors else NOT_CALIBRATED
                 return
             self.motor.release()
             self.state, self.result = AxisState.CLOSED_LOOP_CONTROL, SUCCESS
+            self._opening = self.settings.brake_opens
 
     def _set_controller_mode(self, control: int, entry: int) -> None:
         self._mode = (control, entry)
@@ -312,7 +322,7 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         winch = self._rig.winches[number]
         return SimulatedOdrive(
             winch.node_id,
-            _settings(self._document, self._layouts),
+            _settings(self._document, self._layouts, brake=winch.brake),
             self._layouts,
             winch.counts_per_turn,
             self._document.motor_torque_constant_nm_a,
@@ -359,14 +369,18 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
             drive.receive(command, message.data)
 
 
-def _settings(document: OdriveDocument, layouts: Layouts) -> OdriveSettings:
-    """Settings as if the rig file's values had been written with odrivetool."""
+def _settings(document: OdriveDocument, layouts: Layouts, *, brake: bool) -> OdriveSettings:
+    """Settings as if the rig file's values had been written with odrivetool.
+
+    A brake takes as long to open as the rig file allows.
+    """
     watchdog = document.watchdog_ms
     settings = OdriveSettings(
         watchdog=watchdog / 1000.0 if watchdog is not None else None,
         heartbeat=document.heartbeat_ms / 1000.0,
         estimates=document.estimates_ms / 1000.0,
         torques=document.torques_ms / 1000.0,
+        brake_opens=document.brake_opens_ms / 1000.0 if brake else 0.0,
     )
     if document.endpoints is not None:
         known = read_endpoints(Path(document.endpoints), document, layouts)

@@ -74,7 +74,7 @@ class OdriveBench:
         self.group.configure()
         self.group.read_positions()
         self.group.command(GroupCommand.ENABLE)
-        for _ in range(30):
+        for _ in range(60):
             status = self.cycle()
             if status.state is not GroupState.ENABLING:
                 break

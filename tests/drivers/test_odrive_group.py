@@ -144,7 +144,7 @@ def test_drives_can_be_enabled_again_after_a_stop(bench: OdriveBench) -> None:
         bench.group.command(GroupCommand.ENABLE)
     bench.cycles(30)
     bench.group.command(GroupCommand.ENABLE)
-    assert bench.cycles(10).state is GroupState.ENABLED
+    assert bench.cycles(30).state is GroupState.ENABLED
 
 
 def test_without_a_master_all_are_disarmed_together_by_their_watchdogs(bench: OdriveBench) -> None:
@@ -273,6 +273,64 @@ def test_the_first_tensions_of_enabled_drives_were_sent_under_torque(
         assert status.state is GroupState.ENABLED, status.faults
         tensions = bench.rig.tensions_by(status.torques)
         assert tensions == pytest.approx(bench.rehearsal.tensions, abs=0.1)
+
+
+@pytest.mark.parametrize("torques_ms", [5, 10, 50])
+@pytest.mark.parametrize("heartbeat_ms", [20, 50])
+@pytest.mark.parametrize("opens_ms", [30, 50, 100, 150, 400])
+def test_drives_count_as_enabled_once_their_brakes_have_opened(
+    torques_ms: int, heartbeat_ms: int, opens_ms: float
+) -> None:
+    """An armed motor carries nothing before: its 0 N were a slack cable, and a jog failed."""
+    rig = odrive_rig(torques_ms=torques_ms, heartbeat_ms=heartbeat_ms, brake_opens_ms=opens_ms)
+    with odrive_bench(rig) as bench:
+        bench.group.configure()
+        at_rest = bench.group.read_positions().positions
+        bench.group.command(GroupCommand.ENABLE)
+        closed = 0
+        while (status := bench.cycle((at_rest + 500).tolist())).state is GroupState.ENABLING:
+            closed += not any(drive.torque_on for drive in bench.drives)
+            assert np.array_equal(bench.group.targets, at_rest)
+            assert np.array_equal(status.positions, at_rest)
+        assert status.state is GroupState.ENABLED, status.faults
+        assert closed >= opens_ms / 10 - 1
+        tensions = bench.rig.tensions_by(status.torques)
+        assert tensions == pytest.approx(bench.rehearsal.tensions, abs=0.1)
+
+
+def test_an_armed_motor_neither_pulls_nor_moves_before_its_brake_is_open() -> None:
+    with odrive_bench(odrive_rig(watchdog_ms=200)) as bench:
+        bench.group.configure()
+        bench.rehearsal.pump()
+        drive, layouts = bench.drives[2], read_layouts()
+        arm = layouts.set_axis_state.pack(AxisState.CLOSED_LOOP_CONTROL)
+        ahead = layouts.set_input_pos.pack(0.01, 0.0, 0.0)
+        drive.receive(SET_AXIS_STATE, arm)
+        drive.receive(SET_INPUT_POS, ahead)
+        began = drive.motor.position
+        bench.rehearsal.advance(0.149)
+        assert drive.state is AxisState.CLOSED_LOOP_CONTROL
+        assert (drive.motor.position, drive.torque, drive.torque_on) == (began, 0.0, False)
+        bench.rehearsal.advance(0.021)
+        assert drive.torque_on
+        assert drive.motor.position == pytest.approx(0.01 * bench.rig.winches[2].counts_per_turn)
+        bench.rehearsal.advance(0.2)
+        assert drive.errors == AxisError.WATCHDOG_TIMER_EXPIRED
+
+
+def test_drives_without_brakes_are_enabled_at_once() -> None:
+    took = {}
+    for brakes in (True, False):
+        with odrive_bench(odrive_rig(brakes)) as bench:
+            bench.group.configure()
+            bench.group.read_positions()
+            bench.group.command(GroupCommand.ENABLE)
+            took[brakes] = 1
+            while bench.cycle().state is GroupState.ENABLING:
+                took[brakes] += 1
+            tensions = bench.rig.tensions_by(bench.cycle().torques)
+            assert tensions == pytest.approx(bench.rehearsal.tensions, abs=0.1)
+    assert took[True] == took[False] + 15
 
 
 def test_a_drive_that_sends_no_torque_once_enabled_is_a_fault(bench: OdriveBench) -> None:

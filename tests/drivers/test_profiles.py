@@ -950,7 +950,28 @@ def test_an_unknown_profile_lists_those_there_are(rig: Rig) -> None:
             'torque_limit: {object: "6073h:00", rated: "6075h:00", rated_value: 819}',
             "exclude each other",
         ),
-        ('torque_limit: {object: "207Fh:00", rated_value: 0}', "rated_value"),
+        ('torque_limit: {object: "207Fh:00", rated_value: 0}', "rated_value: must be 10 or more"),
+        ('torque_limit: {object: "207Fh:00", rated_value: 5.4}', "too coarse; it is 5.4"),
+        (
+            'torque_limit: {object: "6072h:00", bytes: 2, rated_value: 819}\nabsent: ["6072h:00"]',
+            "torque_limit.object: this program writes 6072h:00 itself",
+        ),
+        (
+            'torque_limit: {object: "6065h:00", rated_value: 100}\nabsent: ["6072h:00"]',
+            "torque_limit.object: this program writes 6065h:00 itself",
+        ),
+        (
+            'torque_limit: {object: "6073h:00", rated: "6066h:00"}\nabsent: ["6072h:00"]',
+            "torque_limit.rated: this program writes 6066h:00 itself",
+        ),
+        (
+            'torque_limit: {object: "6073h:00", rated: "6073h:00"}\nabsent: ["6072h:00"]',
+            "torque_limit.rated: this program writes 6073h:00 itself",
+        ),
+        (
+            'expect: [{object: "1007h:00", value: 0, name: x, why: y}]\nabsent: ["1007h:00"]',
+            "1007h:00 is in absent",
+        ),
         ('warnings: ["31"]', "3180h"),
         ('warnings: ["3180h", "81xxh"]', "includes 8130h"),
         ('warnings: ["8612h"]', "includes 8612h"),
@@ -1233,6 +1254,47 @@ def test_doctor_names_the_other_object_that_stops_a_drive(
     assert change[f"{missing:04X}h:00"].startswith(step)
 
 
+@pytest.mark.parametrize(
+    ("lines", "lacks", "wrong"),
+    [
+        ("", True, {"1006h:00": UNMONITORED, "1016h:00": UNMONITORED}),
+        ('absent: ["1006h:00"]\nmonitoring: heartbeat', True, {"1016h:00": UNMONITORED}),
+        (
+            "",
+            False,
+            {
+                "1016h:00": "list it as absent in your own drive profile, with monitoring: sync;"
+                " the SYNC time-out alone then stops the drive"
+            },
+        ),
+    ],
+)
+def test_a_drive_without_heartbeat_entries_is_as_one_without_their_object(
+    rig: Rig, tmp_path: Path, lines: str, lacks: bool, wrong: dict[str, str]
+) -> None:
+    """It was sent to a profile that is refused, or was "not safe to run" although it is."""
+    bus = eight_of("cia402")
+    for drive in bus.drives.values():
+        drive.values[0x1016, 0] = 0
+        drive.aborts |= {(0x1006, 0): 0x06020000} if lacks else {}
+    rows = examined(with_profile(rig, lab_profile(tmp_path, lines)), bus).rows
+    assert {row.object[:8]: row.change for row in rows if row.verdict == "wrong"} == wrong
+    if not lacks:
+        assert examined(with_profile(rig, lab_profile(tmp_path, 'absent: ["1016h:01"]')), bus).good
+
+
+@pytest.mark.parametrize(
+    ("absent", "said"), [("[]", "unused (communication_cycle_period)"), ('["1006h:00"]', "unused")]
+)
+def test_doctor_names_a_key_of_1006h_only_where_the_profile_may_have_it(
+    rig: Rig, tmp_path: Path, absent: str, said: str
+) -> None:
+    lines = f"absent: {absent}\nmonitoring: heartbeat"
+    rows = examined(with_profile(rig, lab_profile(tmp_path, lines)), eight_of("cia402")).rows
+    (row,) = (row for row in rows if row.object.startswith("1006h"))
+    assert row.meaning == f"{said}: the heartbeat stops the drive"
+
+
 def test_the_texts_on_supported_modes_name_no_make(rig: Rig) -> None:
     """Technosoft iPOS has CSP since 2017: manual P091.063.iPOS.STO.UM.0117, section 10."""
     bus = eight_of("cia402")
@@ -1455,7 +1517,7 @@ def test_a_current_limit_of_16_bits_is_set(rig: Rig, tmp_path: Path, keys: str, 
     assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
 
 
-@pytest.mark.parametrize(("rated", "limit"), [("819", 983), ("0.5", 1), ("54000", 64800)])
+@pytest.mark.parametrize(("rated", "limit"), [("819", 983), ("10.1", 13), ("54000", 64800)])
 def test_a_current_limit_in_a_unit_that_no_object_states_is_set(
     rig: Rig, tmp_path: Path, rated: str, limit: int
 ) -> None:
@@ -1468,6 +1530,38 @@ def test_a_current_limit_in_a_unit_that_no_object_states_is_set(
     assert row.needed == f"{limit}, written at configuration"
     set_up(theirs, bus)
     assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
+
+
+def test_a_current_limit_beyond_its_size_is_refused_before_anything_is_written(
+    rig: Rig, tmp_path: Path
+) -> None:
+    """Doctor said ok; the set-up ended after 38 objects of the first drive, without its state."""
+    line = "torque_limit: {object: '6073h:00', bytes: 2, rated_value: 60000}"
+    theirs = with_profile(rig, lab_profile(tmp_path, f'{line}\nabsent: ["6072h:00"]'))
+    bus = eight_of("cia402")
+    with_max_current(bus)
+    for does in (examined, set_up):
+        with pytest.raises(BadInput, match="6073h:00 current limit cannot hold 72000") as caught:
+            does(theirs, bus)
+        assert "`bytes`" in caught.value.next_step
+    assert not downloads(bus)
+
+
+def test_a_rated_current_too_large_for_the_limit_is_refused_before_anything_is_written(
+    rig: Rig, tmp_path: Path
+) -> None:
+    line = "torque_limit: {object: '6073h:00', bytes: 2, rated: '6075h:00'}"
+    theirs = with_profile(rig, lab_profile(tmp_path, f'{line}\nabsent: ["6072h:00"]'))
+    bus = eight_of("cia402")
+    with_max_current(bus)
+    bus.drives[3].values[0x6075, 0] = 60_000
+    (row,) = [row for row in examined(theirs, bus).rows if row.verdict == "wrong"]
+    assert (row.object[:8], row.found["60000"]) == ("6075h:00", [3])
+    assert row.change.startswith("its 2 bytes cannot hold 72000: check `bytes`")
+    with pytest.raises(Refused, match="its 2 bytes cannot hold 72000") as caught:
+        set_up(theirs, bus)
+    assert "the drives were not changed" in caught.value.next_step
+    assert not downloads(bus)
 
 
 def test_a_current_limit_of_another_size_names_the_key_for_it(rig: Rig, tmp_path: Path) -> None:

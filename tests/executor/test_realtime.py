@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE
+from executor.realtime import scheduling
+from executor.realtime.scheduling import CAP_IPC_LOCK, CAP_SYS_NICE, has_capability
 
 ROOT = Path(__file__).parents[2]
 #: Drops a privilege for good, then prints whether it is still there.
@@ -36,3 +37,17 @@ def test_a_privilege_is_distinguished_from_being_root(dropped: int, expected: st
     if answer.stdout.strip() == "False False":
         pytest.skip("only a process with these privileges can give one up")
     assert answer.stdout.strip() == expected, answer.stderr
+
+
+@pytest.mark.parametrize(
+    ("users", "counts"), [("0 1000 1", False), ("0 0 4294967295", True), (None, True)]
+)
+def test_in_a_rootless_container_no_capability_counts(
+    users: str | None, counts: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It has all of them there, but the kernel asks for those of the machine."""
+    (tmp_path / "status").write_text("Name: python\nCapEff:\t000001ffffffffff\n")
+    if users is not None:
+        (tmp_path / "uid_map").write_text("".join(f"{each:>11}" for each in users.split()) + "\n")
+    monkeypatch.setattr(scheduling, "Path", lambda path: tmp_path / Path(path).name)
+    assert [has_capability(each) for each in (CAP_IPC_LOCK, CAP_SYS_NICE)] == [counts] * 2

@@ -96,8 +96,11 @@ def test_a_plan_is_run_on_odrives_from_the_rig_file_alone(plan: Path, tmp_path: 
     assert "odrive, 1000 kbit/s" in (run / "report.html").read_text()
 
 
-def test_a_jog_with_rare_torques_passes(tmp_path: Path) -> None:
-    rig, run = changed_rig(tmp_path, torques_ms=50), tmp_path / "jog"
+@pytest.mark.parametrize("drives", [{"torques_ms": 50}, {"heartbeat_ms": 20}])
+def test_a_jog_begins_when_the_motors_carry_the_cables(
+    tmp_path: Path, drives: dict[str, int]
+) -> None:
+    rig, run = changed_rig(tmp_path, **drives), tmp_path / "jog"
     answer = call("jog", rig, "--by-mm", "0", "0", "-2", "--no-scene", "--fast", "-o", run)
     assert answer.code == 0, answer
     cycles = RunFolder(run).cycles()

@@ -8,6 +8,7 @@ import pytest
 
 from drivers.cia402.profile import load_profile
 from model.files.drive_profile_file import TorqueLimit
+from simulation.drives.eds_file import profile_path, read_eds
 from tests.simulation.drive_line import (
     CYCLE,
     DISABLED,
@@ -208,10 +209,10 @@ def test_at_the_torque_limit_the_motor_does_not_wind_in_further(line: Line) -> N
 
 
 def test_a_torque_limit_is_in_the_unit_of_its_profile() -> None:
-    limit = TorqueLimit(object="6072h:00", bytes=2, rated_value=819.0)
-    profile = load_profile("cia402").model_copy(update={"torque_limit": limit})
-    line = ready(profile=profile)
-    line.write(0x6072, 0, "<H", 983)  # 1200 per mille
+    limit = TorqueLimit(object="6073h:00", bytes=2, rated_value=819.0)
+    profile = load_profile("akd").model_copy(update={"torque_limit": limit})
+    line = ready(profile=profile, eds=read_eds(profile_path("akd")))
+    line.write(0x6073, 0, "<H", 983)  # 1200 per mille
     line.enable()
     for torque, shown in ((-1199.0, 0x1000), (-1201.0, 0x1800)):
         line.drive.torque = torque
