@@ -254,7 +254,7 @@ def test_an_end_with_margin_for_a_plan_without_rotation_has_it_as_a_remedy(hall,
         low, high = (force, high) if margin > reserves[1] else (low, force)
     with pytest.raises(BadInput, match="the cables can hold the platform") as caught:
         require_usable_ends(hall, loaded, free_rotation=True)
-    assert "without rotation" in caught.value.next_step
+    assert "plan without `free_rotation=True`" in caught.value.next_step
     require_usable_ends(hall, loaded)
 
 

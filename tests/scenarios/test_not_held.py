@@ -389,7 +389,7 @@ def test_a_second_drive_that_does_not_hold_is_named_with_what_to_do(
         outcome = stage.run()
         summary = concluded(stage, outcome)
     assert outcome.cause.startswith("cable 5 (drive 5)")
-    assert words in outcome.cause.partition("fault latched")[2], "the latch keeps it"
+    assert words in outcome.cause.partition("quick stop of all drives")[2], "the latch keeps it"
     first, *others = summary["reasons"]
     assert words not in first, "each is stated once"
     (second,) = (reason for reason in others if words in reason)
