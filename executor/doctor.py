@@ -29,7 +29,7 @@ from drivers.can_interfaces import (
     can_interfaces,
     set_up_again,
 )
-from executor.cameras.sources import parse_camera_sources
+from executor.cameras.sources import OneCamera, parse_camera_sources, source_texts
 from executor.realtime.scheduling import (
     ALLOW_GROUP,
     CAP_IPC_LOCK,
@@ -101,7 +101,9 @@ def check_machine() -> list[MachineCheck]:
     return [python_version(), *own_packages(), *libraries(), *machine()]
 
 
-def check_rig(rig: Rig, camera: str | Sequence[str] | None = None) -> list[MachineCheck]:
+def check_rig(
+    rig: Rig, camera: OneCamera | Sequence[OneCamera] | None = None
+) -> list[MachineCheck]:
     """Checks the rig's tag detector, drive files, bus and cameras.
 
     Args:
@@ -112,7 +114,7 @@ def check_rig(rig: Rig, camera: str | Sequence[str] | None = None) -> list[Machi
     Raises:
         BadInput: A source names no camera of the rig file.
     """
-    sources = [camera] if isinstance(camera, str) else camera or []
+    sources = [] if camera is None else source_texts("camera", camera)
     detector = libraries({"pyapriltags": "pyapriltags"} if rig.tag_detector == "apriltag" else {})
     return [*detector, *rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, sources)]
 

@@ -368,7 +368,7 @@ def _tension_issues(result: RigCalibration) -> list[Issue]:
     return [
         Issue(
             f"tensions were not measured at {missing} poses, which makes cable lengths"
-            f" uncertain by {stretch * 1e3:.2g} mm; from the encoders alone it is"
+            f" uncertain by {stretch * 1e3:.2g} mm; with measured tensions it is"
             f" {usual * 1e3:.2g} mm",
             "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
         )

@@ -25,7 +25,7 @@ from tracking.camera_model import (
 )
 from tracking.detection.detector import Detection, make_detector
 from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored, diagnose_tags
-from tracking.detection.tags import CORNER_SIGNS, modules_across
+from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror, modules_across
 from tracking.edges.refine import RefinedTag, refine
 from tracking.estimator import TrackerSettings
 from tracking.pnp import BundlePose, TagView, solve_pnp
@@ -98,6 +98,7 @@ def observe_tags(
     """
     family = rig.tag_family
     detector, modules = make_detector(rig.tag_detector, family), modules_across(family)
+    alike, shown = alike_in_mirror(family), set[int]()
     found: dict[str, Mapping[int, RefinedTag]] = {}
     left_out = dict(unused or {})
     example: tuple[str, Image] | None = None
@@ -112,13 +113,14 @@ def observe_tags(
         left_out |= {f"{name}, tag {number}": "is detected more than once" for number in twice}
         squares = _whole(image, camera, [d for d in mine if d.id not in twice], modules)
         if squares:
-            if not found and are_mirrored(image, detector, wanted):
+            if shown <= alike and are_mirrored(image, detector, wanted):
                 raise BadInput(
                     f"{MIRRORED}: {name} shows more tags of the rig if mirrored again",
                     where=f"camera {camera.name}",
                     next_step=UNMIRROR,
                 )
             found[name] = squares
+            shown |= squares.keys()
         elif not twice:
             left_out[name] = "shows no complete tag"
             example = example or (name, image)

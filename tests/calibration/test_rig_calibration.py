@@ -242,6 +242,7 @@ def test_without_tensions_the_stiffness_stays_as_drawn_and_is_named(
     verdict = judge_rig(result, 10e-3, 0.0).verdict
     assert not verdict.good
     assert verdict.reasons[0].startswith("tensions were not measured at 60 poses")
+    assert "; with measured tensions it is 0.1 mm" in verdict.reasons[0]
     assert any("tension_1_n" in step for step in verdict.next_steps)
 
 

@@ -297,6 +297,17 @@ def test_a_camera_is_opened_and_its_pictures_measured(monkeypatch: pytest.Monkey
     assert "640 x 480 px" in camera["text"]
 
 
+@pytest.mark.parametrize("source", [0, 2, Path("/dev/video7"), [Path("/dev/video7")]])
+def test_an_index_or_a_path_in_python_opens_a_camera(
+    monkeypatch: pytest.MonkeyPatch, source: int | Path | list[Path]
+) -> None:
+    monkeypatch.setattr(cameras, "_opened", lambda _source: FakeCapture())
+    (camera,) = (one for one in doctor.check_rig(load_rig(RIG), source) if "camera" in one.name)
+    assert camera.good
+    (name,) = source if isinstance(source, list) else [source]
+    assert camera.text.startswith(f"{name} opens")
+
+
 def test_a_camera_that_is_not_there_is_missing_and_one_not_named_is_not_tried() -> None:
     code, camera = camera_answer("--camera", "97")
     assert (code, camera["good"]) == (4, False)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 
+import cv2
 import numpy as np
 import pytest
 
@@ -22,8 +23,9 @@ from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tracking.camera_model import Image, pixels_of
-from tracking.detection.detector import TagDetector
-from tracking.detection.diagnostics import diagnose_tags
+from tracking.detection.detector import Detection, TagDetector
+from tracking.detection.diagnostics import are_mirrored, diagnose_tags
+from tracking.detection.tags import alike_in_mirror, dictionary
 from tracking.estimator import TrackerSettings
 from tracking.measurement import NoPose, PoseMeasurement
 from tracking.shared_errors import CameraMoved
@@ -181,6 +183,61 @@ def test_a_tag_that_looks_alike_in_a_mirror_does_not_show_that_images_are_mirror
     seen = [d.id for d in TagDetector("tag25h9").detect(image)]
     assert 22 in seen
     assert "mirrored" not in diagnose_tags(image, "tag25h9", seen)
+
+
+def printed(family: str, *numbers: int) -> Image:
+    """Tags side by side on white."""
+    tags = [cv2.aruco.generateImageMarker(dictionary(family), n, 120) for n in numbers]
+    return np.hstack(
+        [cv2.copyMakeBorder(tag, 60, 60, 60, 60, cv2.BORDER_CONSTANT, value=255) for tag in tags]
+    )
+
+
+def test_a_tag_that_is_the_mirror_image_of_an_expected_one_is_not_named_as_mirrored() -> None:
+    """4X4_250 124 is 70 mirrored, to the bit: no image shows which of the two it is."""
+    family, detector = "4X4_250", TagDetector("4X4_250")
+    assert {70, 124} <= alike_in_mirror(family)
+    image = printed(family, 124)
+    assert diagnose_tags(image, family, [70]).startswith("4X4_250 124")
+    assert "mirrored" not in diagnose_tags(image, family, [70])
+    clear = [n for n in range(10) if n not in alike_in_mirror(family)]
+    mirrored = np.ascontiguousarray(printed(family, 70, clear[0])[:, ::-1])
+    assert [d.id for d in detector.detect(mirrored)] == [124]
+    assert "the images are mirrored" in diagnose_tags(mirrored, family, [70, clear[0]])
+
+
+def test_a_tag_of_any_number_in_the_plain_image_shows_that_it_is_not_mirrored() -> None:
+    both = [printed("tag36h11", 5), printed("tag36h11", 6, 7)[:, ::-1]]
+    image, detector = np.ascontiguousarray(np.hstack(both)), TagDetector("tag36h11")
+    assert not are_mirrored(image, detector, [6, 7])
+    assert are_mirrored(np.ascontiguousarray(both[1]), detector, [6, 7])
+
+
+def test_a_tag_that_is_its_own_mirror_image_shows_nothing() -> None:
+    """At the limit of detection it is found in the mirrored image alone by chance."""
+
+    class InMirror(TagDetector):
+        def detect(self, image: Image) -> list[Detection]:
+            return [] if image is plain else super().detect(image)
+
+    plain, detector = printed("4X4_50", 8), InMirror("4X4_50")
+    assert [d.id for d in detector.detect(plain[:, ::-1])] == [8]
+    assert not are_mirrored(plain, detector, [8])
+
+
+def test_mirrored_images_are_named_where_the_first_one_shows_nothing_but_such_a_tag(
+    rig: Rig, camera: Camera, scene: Scene
+) -> None:
+    frame = tuple(replace(tag, id=22 + k) for k, tag in enumerate(rig.frame_tags))
+    alone, truth = frame[:1], Pose.level([0.0, 0.0, 0.445])
+    images = []
+    for tags in (alone, frame):
+        shown = replace(rig, tag_family="tag25h9", frame_tags=tags, platform_tags=())
+        image = SyntheticCamera(shown, scene, camera, seed=1).render(truth, len(images))
+        images.append((f"{len(images)}.png", np.ascontiguousarray(image[:, ::-1])))
+    rig = replace(rig, tag_family="tag25h9", frame_tags=frame, platform_tags=())
+    with pytest.raises(BadInput, match=r"the images are mirrored: 1\.png shows"):
+        observe_tags(images, rig, camera, [tag.id for tag in frame])
 
 
 def test_a_camera_moved_during_a_run_is_noticed(

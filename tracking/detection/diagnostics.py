@@ -15,7 +15,7 @@ from model.rig import Camera
 from model.tag_families import APRILTAG_FAMILIES
 from tracking.camera_model import Image, distort_pixels, linear
 from tracking.detection.detector import TagDetector
-from tracking.detection.tags import CORNER_SIGNS
+from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror
 from tracking.edges.refine import RefinedTag
 
 #: Families that are tried to identify a wrong one. The largest ArUco dictionary of a size includes
@@ -47,15 +47,16 @@ def diagnose_tags(image: Image, family: str, expected: Sequence[int]) -> str:
 
 
 def are_mirrored(image: Image, detector: TagDetector, expected: Collection[int]) -> bool:
-    """Whether an image shows more of the expected tags if it is mirrored.
+    """Whether expected tags appear in the mirrored image alone.
 
-    Some tags are detected in both: mirrored, tag25h9 22 differs from itself in 2 bits only.
+    A tag of any number in the plain image excludes it. Tags of `alike_in_mirror`, such as tag25h9
+    22, count for neither. Tags that only exhaustive detection finds are not considered.
     """
+    alike = alike_in_mirror(detector.family)
+    if any(d.id not in alike for d in detector.detect(image)):
+        return False
     flipped = np.ascontiguousarray(image[:, ::-1])
-    plain, mirrored = (
-        sum(d.id in expected for d in detector.detect(one)) for one in (image, flipped)
-    )
-    return mirrored > plain
+    return any(d.id in expected and d.id not in alike for d in detector.detect(flipped))
 
 
 # Numbers of neighbouring tags in a grid.

@@ -57,6 +57,30 @@ def official_modules(family: str, number: int) -> NDArray[np.bool_]:
     return np.asarray((picture[::-1, ::-1] if drawn_upside_down(family) else picture) > 127)
 
 
+@lru_cache
+def alike_in_mirror(family: str) -> frozenset[int]:
+    """Numbers of tags whose mirror image is read as a tag of the family, often the same.
+
+    Such a reading shows neither that an image is mirrored nor that it is not.
+    """
+    patterns = _patterns(family)
+    modules = patterns.shape[-1]
+    side = math.isqrt(modules)
+    signs = 2.0 * patterns - 1.0
+    flipped = signs[:, 0].reshape(-1, side, side)[:, :, ::-1].reshape(-1, modules)
+    nearest = np.max([(flipped @ signs[:, k].T).max(axis=1) for k in range(4)], axis=0)
+    differing = (modules - nearest) / 2.0
+    return frozenset(np.flatnonzero(differing <= dictionary(family).maxCorrectionBits).tolist())
+
+
+def _patterns(family: str) -> Array:
+    """Inner modules of all tags, each rotated by 0 to 3 quarters, shape (n, 4, modules)."""
+    inner = [official_modules(family, n)[1:-1, 1:-1] for n in range(tags_in(family))]
+    upright = np.array(inner, dtype=np.float64)
+    rotated = [np.rot90(upright, k, axes=(1, 2)).reshape(len(inner), -1) for k in range(4)]
+    return np.stack(rotated, axis=1)
+
+
 def upright_corners(family: str, opencv_corners: Array) -> Array:
     """OpenCV's detected corners, shape (4, 2), in the order of `CORNER_SIGNS`."""
     return np.roll(opencv_corners, 2, axis=0) if drawn_upside_down(family) else opencv_corners
@@ -164,10 +188,7 @@ class TagDecoder:
 
     def __init__(self, family: str) -> None:
         self._side = modules_across(family)
-        inner = [official_modules(family, n)[1:-1, 1:-1] for n in range(tags_in(family))]
-        patterns = np.array(inner, dtype=np.float64)
-        rotated = [np.rot90(patterns, k, axes=(1, 2)).reshape(len(inner), -1) for k in range(4)]
-        self._book = _normalised(np.stack(rotated, axis=1))  # (n, 4, modules)
+        self._book = _normalised(_patterns(family))
         modules = self._book.shape[-1]
         self.least = 1.0 - (1.0 - LEAST_CORRELATION) * min(1.0, modules / LEAST_MODULES)
 
