@@ -240,6 +240,47 @@ def test_a_press_that_ends_while_data_are_stale_is_not_lost_silently(desk: Visit
     expect(desk.page.locator("#notice-box")).to_be_hidden()
 
 
+def test_a_press_that_begins_while_data_are_stale_is_not_lost_silently(desk: Visit) -> None:
+    desk.take_control()
+    desk.view("teach")
+    box, mouse = desk.page.locator("#teach").bounding_box(), desk.page.mouse
+    assert box
+    mouse.move(box["x"] + 20, box["y"] + 10)
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale")).to_be_visible()
+    mouse.down()
+    desk.fake.ask(silent=False)
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    mouse.up()
+    expect(desk.page.locator("#notice")).to_have_text("Not done: data were not current.")
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("teach") == []
+
+
+def test_enter_held_since_data_were_stale_presses_nothing(desk: Visit) -> None:
+    """Its repetitions would press the button that has the focus again."""
+    desk.take_control()
+    desk.load()
+    desk.run()
+    desk.send("hold", "#hold")
+    resume, keyboard = desk.page.locator("#resume"), desk.page.keyboard
+    expect(resume).not_to_have_attribute("aria-disabled", "true")
+    resume.focus()
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale")).to_be_visible()
+    keyboard.down("Enter")
+    desk.fake.ask(silent=False)
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    expect(desk.page.locator("#notice")).to_have_text("Not done: data were not current.")
+    expect(resume).to_be_focused()
+    keyboard.down("Enter")  # repeats
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("resume") == []
+    keyboard.up("Enter")
+    keyboard.press("Enter")
+    desk.fake.wait(desk.page, lambda f: any(m.get("command") == "resume" for m in f["received"]))
+
+
 # For everybody.
 
 

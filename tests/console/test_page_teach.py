@@ -139,6 +139,27 @@ def test_a_pose_is_renamed_once_its_name_is_complete(desk: Visit) -> None:
     assert desk.fake.ask()["stops"] == 0
 
 
+def test_a_half_typed_name_is_put_back_where_the_field_was_left_by_stop(desk: Visit) -> None:
+    desk.fake.ask(set={"poses": [POSE]})
+    desk.take_control()
+    desk.view("teach")
+    field = desk.page.get_by_role("textbox", name="Name of pose 1")
+    field.press("End")
+    desk.page.keyboard.type(" half")
+    desk.fake.ask(silent=True)
+    expect(desk.page.locator("#stale")).to_be_visible()
+    desk.page.keyboard.press("Escape")
+    desk.fake.ask(silent=False)
+    expect(desk.page.locator("#stale")).to_be_hidden()
+    expect(desk.page.locator("#notice")).to_have_text(
+        "“one” was not renamed: data were not current."
+    )
+    expect(field).to_have_value("one")
+    expect(field).not_to_be_focused()
+    desk.fake.let_pass(desk.page)
+    assert desk.fake.received("rename") == []
+
+
 # Paths.
 
 

@@ -44,6 +44,7 @@ async function command(name, fields) {
 const showScene = () => wide.matches || view("live");
 const page = { command, situation, say, scene, view, showScene };
 const stopBar = bindStop(connection, () => {
+  leaveControl();
   cancelDialog();
   jog.end("STOP");
 }, () => {
@@ -93,7 +94,15 @@ function showTitle() {
   if (state) write(document.querySelector("title"), `${connection.freshness().why ? "No current data" : motionText(state)} – ${state.rig}`);
 }
 
-let focusedBefore = null; // when data became stale
+let focusedBefore = null; // when data became stale; gets the focus back unless STOP or a pointer is pressed meanwhile
+const sayLost = () => say("Not done: data were not current.", true);
+window.addEventListener("pointerdown", ({ target, button, isPrimary }) => {
+  leaveControl();
+  if (isPrimary && button === 0 && at("stale").contains(target)) sayLost();
+}, { capture: true });
+window.addEventListener("keydown", ({ key, target }) => {
+  if (key === "Enter" && focusedBefore && target === document.body) sayLost();
+}, { capture: true });
 
 function showAge() {
   const { why, age } = connection.freshness();
@@ -109,18 +118,29 @@ function showAge() {
   // Stale controls cannot be used, not even by keyboard; an open question is withdrawn.
   if (why) checkDialog();
   at("notice-box").inert = why !== null;
-  if (why && !at("main").inert) focusedBefore = focusedControl();
+  if (why && !at("main").inert) focusedBefore = takeFocus();
   if (at("dialog").hidden) at("main").inert = at("tabs").inert = why !== null;
   applyButtons(document.body, situation());
   if (why) return;
   if (document.activeElement === document.body) focusedBefore?.focus({ preventScroll: true });
-  focusedBefore = null;
+  leaveControl();
 }
 
-/** The control that is to get the focus back; none of a jog pad, whose keys move the robot. */
-function focusedControl() {
+/** No control gets the focus back. */
+function leaveControl() {
+  focusedBefore = null;
+  teach.undoUnsent();
+}
+
+/**
+ * Takes the focus from a control at once: a browser does so with the next frame, and a space before it would not stop.
+ * Returns the control that is to get it back; none of a jog pad, whose keys move the robot.
+ */
+function takeFocus() {
   const { activeElement: focused } = document;
-  return focused?.closest("main, #tabs") && !focused.closest("#jog-pad, #cable-pad") ? focused : null;
+  if (!focused?.closest("main, #tabs")) return null;
+  focused.blur();
+  return focused.closest("#jog-pad, #cable-pad") ? null : focused;
 }
 
 let waiting = false;

@@ -45,6 +45,11 @@ export function bindStop(connection, pressed, atRest) {
   });
   const isStop = (event) => [" ", "Escape"].includes(event.key) && !event.isComposing && !isTextField(event.target);
   window.addEventListener("keydown", (event) => {
+    if (event.key === "Enter" && event.repeat) {
+      // Held, it presses once: it must not press a button that gets the focus meanwhile.
+      event.preventDefault();
+      event.stopImmediatePropagation();
+    }
     if (!isStop(event)) return;
     event.preventDefault(); // no press of the focused button, no scrolling
     if (event.key === " ") event.stopImmediatePropagation();

@@ -26,6 +26,7 @@ function freeName(kind, poses) {
 export class Teach {
   #page;
   #shown = "";
+  #unsent = new Map(); // fields that stale data interrupted, with their poses' names: typing may go on afterwards
 
   /** `page` has `command(name, fields)`, `situation()` and `say(text)`. */
   constructor(page) {
@@ -67,6 +68,16 @@ export class Teach {
     this.#arrange(poses);
   }
 
+  /** Puts back the names whose typing stale data interrupted, unless it goes on. */
+  undoUnsent() {
+    for (const [field, name] of this.#unsent) {
+      if (field === document.activeElement) continue;
+      this.#unsent.delete(field);
+      field.value = name;
+      this.#page.say(`“${name}” was not renamed: data were not current.`, true);
+    }
+  }
+
   /** A pose keeps its row, with any text being typed, as long as it keeps its name. */
   #arrange(poses) {
     const list = at("poses"), focused = document.activeElement;
@@ -91,16 +102,16 @@ export class Teach {
   #row(name) {
     const { command, situation } = this.#page;
     const field = make("input", { type: "text", value: name, maxlength: 60, "data-button": "edit_pose", "data-key": "name" });
-    let isUnsent = false; // stale data take the focus, and typing may go on when they are current again
+    const isUnsent = () => this.#unsent.has(field);
     const rename = async () => {
-      isUnsent = situation().stale !== null;
-      if (isUnsent) return;
+      if (situation().stale !== null) return this.#unsent.set(field, name);
+      this.#unsent.delete(field);
       const wanted = field.value.trim();
       if (!wanted || !(await command("rename", { pose: name, name: wanted })).ok) field.value = name;
     };
     field.addEventListener("change", rename);
-    field.addEventListener("blur", () => isUnsent && rename());
-    field.addEventListener("keyup", ({ key }) => key === "Enter" && isUnsent && rename());
+    field.addEventListener("blur", () => isUnsent() && rename());
+    field.addEventListener("keyup", ({ key }) => key === "Enter" && isUnsent() && rename());
     const button = (text, title, key, press) =>
       make("button", { type: "button", "data-button": "edit_pose", "data-title": title, "data-name": title, "data-key": key, "aria-label": title, onclick: press }, text);
     const goTo = button("Go to", `Plan a path to ${name}`, "go", () => this.#plan({ pose: name }));
