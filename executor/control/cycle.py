@@ -329,7 +329,10 @@ class Cycle:
         )
         self._watch, alarms = self._watch.update(seen)
         self._stuck, stuck = self._stuck.update(
-            following, status.positions.tolist(), status.demands.tolist(), missing
+            following,
+            status.positions.tolist(),
+            status.set_points.tolist(),
+            (~status.renewed).tolist(),
         )
         return (*alarms, *stuck)
 
