@@ -48,6 +48,7 @@ def monitor_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) ->
         max_tension=high,
         no_tension=LOOSE_SHARE * rig.min_tension if slack_counts else -math.inf,
         gone_periods=sync_age.limit - 1.0,
+        may_disarm=isinstance(rig.document.drives, OdriveDocument),
     )
 
 

@@ -125,16 +125,20 @@ class StuckWatch:
 
     drives: tuple[Drive, ...]
     names: tuple[str, ...]
+    may_disarm: bool = False
 
     @classmethod
-    def fresh(cls, limits: Sequence[StuckLimits], names: Sequence[str]) -> StuckWatch:
+    def fresh(
+        cls, limits: Sequence[StuckLimits], names: Sequence[str], *, may_disarm: bool = False
+    ) -> StuckWatch:
         """The initial state.
 
         Args:
             limits: One per drive.
             names: Of the drives.
+            may_disarm: As in `MonitorLimits`.
         """
-        return cls(tuple(Drive(each) for each in limits), tuple(names))
+        return cls(tuple(Drive(each) for each in limits), tuple(names), may_disarm)
 
     def update(
         self,
@@ -163,7 +167,13 @@ class StuckWatch:
         )
         each = zip(self.names, drives, missing, strict=True)
         found = [
-            stuck(number, name, drive.stalled * drive.limits.period, fault=drive.is_stuck)
+            stuck(
+                number,
+                name,
+                drive.stalled * drive.limits.period,
+                fault=drive.is_stuck,
+                may_disarm=self.may_disarm,
+            )
             for number, (name, drive, silent) in enumerate(each, start=1)
             if drive.stalled and not silent
         ]

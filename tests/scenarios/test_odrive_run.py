@@ -233,6 +233,36 @@ def test_a_drive_whose_position_is_often_overdue_ends_the_run_along_the_path(
     assert outcome.cause == said
 
 
+@pytest.mark.parametrize(
+    ("holding", "said"),
+    [
+        (
+            False,
+            "did not move for 2 cycles while its set-points advanced: it is jammed or disarmed",
+        ),
+        (True, "all 8 cables carry no tension: they are broken or slack, or their drives are dis"),
+    ],
+)
+def test_an_emergency_stop_is_no_broken_cable(
+    prepared: PreparedRun, tmp_path: Path, holding: bool, said: str
+) -> None:
+    """Motion and tensions are missed before the next heartbeats give the reason."""
+
+    def press(stage: Any) -> None:
+        for drive in stage.drives:
+            drive.fail(AxisError.ESTOP_REQUESTED)
+
+    def script(stage: Any) -> None:
+        at(CRUISING - 50, lambda stage: stage.board.ask_hold(holding))(stage)
+        at(CRUISING, press)(stage)
+
+    with staged(prepared, tmp_path / "run", script) as (stage, _):
+        outcome = stage.run()
+        events = stage.events()
+    assert said in outcome.cause
+    assert any("emergency stop" in e.text for e in events if e.code == "drive_fault")
+
+
 @pytest.mark.parametrize(("drive", "estimates_ms"), [(2, 10), (4, 10), (2, 30), (2, 50)])
 def test_a_drive_that_jams_stops_the_run_before_its_cable_is_overloaded(
     plan: Path, tmp_path: Path, drive: int, estimates_ms: float

@@ -66,6 +66,11 @@ def test_how_long_a_drive_may_stall_is_in_the_rig_file():
     assert stuck_limits(noisy, 0.01) == (StuckLimits(least=20, travel=274),) * 8
 
 
+def test_only_odrives_disarm_before_they_report_it():
+    assert monitor_limits(load_rig(ODRIVE_RIG), SyncAge()).may_disarm
+    assert not monitor_limits(load_rig(RIG), SyncAge()).may_disarm
+
+
 @pytest.mark.parametrize(
     ("estimates_ms", "least", "period"),
     [(1, 8, 1), (10, 8, 1), (19, 16, 1), (30, 24, 3), (50, 40, 5)],

@@ -216,6 +216,16 @@ def test_a_drive_that_reports_at_its_own_moments_is_not_stalled(period, turn, re
     assert first_found(told, asked, limits) is None
 
 
+def test_a_drive_that_may_disarm_itself_may_not_be_jammed():
+    watch = StuckWatch.fresh((LIMITS,), NAMES[:1], may_disarm=True)
+    texts = []
+    for k in range(5):
+        watch, found = watch.update(True, (min(100 * k, 200),), (100 * k,), (False,))
+        texts += [alarm.text for alarm in found]
+    stop = STOP.format(NAMES[0], 2)
+    assert texts == [NOTE.format(NAMES[0]), f"{stop}: it is jammed or disarmed"]
+
+
 def test_an_entry_is_needed_for_every_drive():
     watch = StuckWatch.fresh((LIMITS, LIMITS), NAMES)
     for position in (1, 2, 3):
