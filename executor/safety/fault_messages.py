@@ -64,7 +64,7 @@ def stuck(drive: int, name: str, cycles: int, *, fault: bool, may_disarm: bool =
     """A drive did not follow its set-points, in the last cycles."""
     text = f"{name} did not move for {_cycles(cycles)} while its set-points advanced"
     if fault:
-        text += ": it is jammed or disarmed" if may_disarm else ""
+        text += ": it may be jammed or disarmed" if may_disarm else ""
         return Alarm(StopReaction.QUICK_STOP, "drive_stuck", text, drive)
     return Alarm(StopReaction.NOTE, "set_point_missed", text, drive)
 

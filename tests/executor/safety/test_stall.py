@@ -223,7 +223,7 @@ def test_a_drive_that_may_disarm_itself_may_not_be_jammed():
         watch, found = watch.update(True, (min(100 * k, 200),), (100 * k,), (False,))
         texts += [alarm.text for alarm in found]
     stop = STOP.format(NAMES[0], 2)
-    assert texts == [NOTE.format(NAMES[0]), f"{stop}: it is jammed or disarmed"]
+    assert texts == [NOTE.format(NAMES[0]), f"{stop}: it may be jammed or disarmed"]
 
 
 def test_an_entry_is_needed_for_every_drive():
