@@ -128,6 +128,9 @@ class CycleStatus:
             the last known one for a missing drive.
         demands: Commanded positions at the time of `positions`, shape (m,), [counts]: at a SYNC the
             targets of the previous cycle. `positions - demands` is the following error.
+        set_points: Set-points by which a stalled drive is detected, shape (m,), [counts]: `demands`
+            or, where these are chosen by `positions`, the last ones sent.
+        renewed: True for drives whose position is new in this cycle, shape (m,).
         torques: Actual torques, positive when winding in, shape (m,), [per mille of
             rated torque]. Tension at rest is torque / 1000 times the winch's `torque_constant`.
         status_words: State of each drive in the code of its protocol, shape (m,); see
@@ -147,6 +150,8 @@ class CycleStatus:
 
     positions: Counts
     demands: Counts
+    set_points: Counts
+    renewed: NDArray[np.bool_]
     torques: Counts
     status_words: Counts
     missing: NDArray[np.bool_]

@@ -381,12 +381,15 @@ class Cia402Group(CyclicGroup):
         read = watch.positions, self._demands, watch.status_words
         positions, demands, words = (np.array(values, dtype=np.int64) for values in read)
         torques = np.array(watch.torques, dtype=np.int64) * self._signs
-        missing = ~np.array(watch.answered)
-        for array in (positions, demands, torques, words, missing):
+        answered = np.array(watch.answered)
+        missing = ~answered
+        for array in (positions, demands, torques, words, answered, missing):
             array.setflags(write=False)
         return CycleStatus(
             positions=positions,
             demands=demands,
+            set_points=demands,
+            renewed=answered,
             torques=torques,
             status_words=words,
             missing=missing,

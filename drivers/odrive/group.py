@@ -334,14 +334,16 @@ class OdriveGroup(CyclicGroup):
         demands = np.clip(positions, targets.min(axis=0), targets.max(axis=0))
         torques = np.rint(np.array(watch.torques) * self._per_mille).astype(np.int64)
         words = np.array(watch.status_words, dtype=np.int64)
-        missing = np.array(watch.missing)
-        for array in (positions, demands, torques, words, missing):
+        missing, renewed = np.array(watch.missing), np.array(watch.renewed)
+        for array in (positions, demands, targets, torques, words, missing, renewed):
             array.setflags(write=False)
         braked = self.capabilities.has_brake and self._all_disarmed()
         following = self._state in (GroupState.ENABLING, GroupState.ENABLED) or self.stopping
         return CycleStatus(
             positions=positions,
             demands=demands,
+            set_points=targets[-1],
+            renewed=renewed,
             torques=torques,
             status_words=words,
             missing=missing,

@@ -125,6 +125,11 @@ class OdriveMonitor:
         return self.overdue("position")
 
     @property
+    def renewed(self) -> list[bool]:
+        """True for drives that reported a position in the cycle that has just ended."""
+        return [age == 1 for age in self._ages["position"]]
+
+    @property
     def measures_tensions(self) -> bool:
         """Whether every axis is under torque, and has sent one since its brake must be open.
 

@@ -193,7 +193,8 @@ class Cycle:
         self._numbers = {node: k for k, node in enumerate(rig.drive_names, start=1)}
         limits = monitor_limits(rig, master.rule, slack_counts=slack_counts)
         self._watch = Monitor.fresh(limits, names)
-        self._stuck = StuckWatch.fresh(stuck_limits(rig, checked.cycle), names)
+        stuck = stuck_limits(rig, checked.cycle)
+        self._stuck = StuckWatch.fresh(stuck, names, may_disarm=limits.may_disarm)
         self.armed = False
         self.latched = self.faulted = False
         self._unsent = 0.0
@@ -329,7 +330,10 @@ class Cycle:
         )
         self._watch, alarms = self._watch.update(seen)
         self._stuck, stuck = self._stuck.update(
-            following, status.positions.tolist(), status.demands.tolist(), missing
+            following,
+            status.positions.tolist(),
+            status.set_points.tolist(),
+            (~status.renewed).tolist(),
         )
         return (*alarms, *stuck)
 

@@ -60,10 +60,11 @@ def replies_missing(drive: int, name: str, missing: int, cycles: int) -> Alarm:
     return Alarm(StopReaction.PATH_STOP, "drive_silent", text, drive)
 
 
-def stuck(drive: int, name: str, cycles: int, *, fault: bool) -> Alarm:
+def stuck(drive: int, name: str, cycles: int, *, fault: bool, may_disarm: bool = False) -> Alarm:
     """A drive did not follow its set-points, in the last cycles."""
     text = f"{name} did not move for {_cycles(cycles)} while its set-points advanced"
     if fault:
+        text += ": it may be jammed or disarmed" if may_disarm else ""
         return Alarm(StopReaction.QUICK_STOP, "drive_stuck", text, drive)
     return Alarm(StopReaction.NOTE, "set_point_missed", text, drive)
 
@@ -74,10 +75,20 @@ def following_error(cable: int, error: float, limit: float) -> Alarm:
     return Alarm(StopReaction.QUICK_STOP, "following_error", text, cable)
 
 
-def cable_loose(cable: int, tension: float) -> Alarm:
-    """A cable has no tension, [N]."""
+def cable_loose(cable: int, tension: float, may_disarm: bool) -> Alarm:
+    """A cable has no tension, [N]; its drive may disarm before it reports that."""
     text = f"cable {cable} carries {tension:.1f} N, no tension: it is broken or slack"
+    if may_disarm:
+        text += ", or its drive is disarmed"
     return Alarm(StopReaction.QUICK_STOP, "cable_loose", text, cable)
+
+
+def all_loose(cables: int, may_disarm: bool) -> Alarm:
+    """No cable has any tension; see `cable_loose`."""
+    text = f"all {cables} cables carry no tension: they are broken or slack"
+    if may_disarm:
+        text += ", or their drives are disarmed"
+    return Alarm(StopReaction.QUICK_STOP, "cable_loose", text)
 
 
 def slack(cable: int, tension: float, limit: float) -> Alarm:

@@ -11,6 +11,7 @@ from executor.safety.gate import Limits
 from executor.safety.monitor import MonitorLimits
 from executor.safety.stall import StuckLimits
 from executor.safety.sync_timeout import SyncAge
+from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
 #: A cable is slack below this share of the least planned tension. Plans reach the least tension
@@ -47,6 +48,7 @@ def monitor_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) ->
         max_tension=high,
         no_tension=LOOSE_SHARE * rig.min_tension if slack_counts else -math.inf,
         gone_periods=sync_age.limit - 1.0,
+        may_disarm=isinstance(rig.document.drives, OdriveDocument),
     )
 
 
@@ -57,11 +59,15 @@ def stuck_limits(rig: Rig, cycle: float) -> tuple[StuckLimits, ...]:
         rig: The robot.
         cycle: [s].
     """
-    step, travel = rig.motion.stuck_speed * cycle, rig.motion.stuck_travel
+    drives = rig.document.drives
+    period = drives.estimates_ms / 1000.0 if isinstance(drives, OdriveDocument) else cycle
+    period = max(cycle, period)
+    step, travel = rig.motion.stuck_speed * period, rig.motion.stuck_travel
     return tuple(
         StuckLimits(
             least=max(LEAST_STEP, math.ceil(step * abs(winch.counts_per_metre))),
             travel=max(LEAST_TRAVEL, math.ceil(travel * abs(winch.counts_per_metre))),
+            period=math.floor(period / cycle + 1e-9),
         )
         for winch in rig.winches
     )

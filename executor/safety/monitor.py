@@ -33,6 +33,7 @@ class MonitorLimits:
         lost_replies: Missing replies of a drive among its last `REPLY_WINDOW` that cause a path
             stop.
         late_periods: Lateness, in cycles, that causes a path stop.
+        may_disarm: Whether drives disarm before they report it, so that cables lose their tension.
         gone_periods: Lateness, in cycles, after which drives may have stopped on their own for
             lack of SYNC: no set-point may follow. See `SyncAge`.
     """
@@ -47,6 +48,7 @@ class MonitorLimits:
     lost_replies: int = LOST_REPLIES
     late_periods: float = LATE_AGE - 1.0
     gone_periods: float = SyncAge().limit - 1.0
+    may_disarm: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,10 +198,13 @@ class Monitor:
 
     def _tensions(self, seen: Observation) -> list[Alarm]:
         limits, found = self.limits, []
+        loose = [count >= limits.loose_cycles for count in self.loose]
+        if len(loose) > 1 and any(loose) and all(self.loose):  # not all of them in the same cycle
+            return [fault_messages.all_loose(len(loose), limits.may_disarm)]
         for drive, tension in enumerate(seen.tensions):
             cable = drive + 1
-            if self.loose[drive] >= limits.loose_cycles:
-                found.append(fault_messages.cable_loose(cable, tension))
+            if loose[drive]:
+                found.append(fault_messages.cable_loose(cable, tension, limits.may_disarm))
             elif self.slack[drive] >= limits.slack_cycles:
                 found.append(fault_messages.slack(cable, tension, limits.min_tension))
             if self.over[drive] >= limits.slack_cycles:

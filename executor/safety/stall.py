@@ -17,6 +17,7 @@ of a drive that has followed since: at the start of a motion a servo lags.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -35,12 +36,19 @@ class StuckLimits:
     """Stall limits of one drive.
 
     Attributes:
-        least: Smaller set-point steps from cycle to cycle are not judged, [counts].
+        least: Smaller set-point steps from reply to reply are not judged, [counts].
         travel: Travel of the set-points over which a drive is judged, [counts].
+        period: Cycles from reply to reply.
     """
 
     least: int
     travel: int
+    period: int = 1
+
+    @property
+    def replies(self) -> int:
+        """Replies of a stalled drive that are a fault."""
+        return math.ceil(STUCK_CYCLES / self.period)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +59,7 @@ class Drive:
         limits: Its limits.
         replies: Position and demand of each reply in the window, [counts]; the oldest first.
         followed: It has followed; a drive that has not yet begun to move is not judged.
-        stalled: Stalled cycles up to the last reply; 0 for a drive that moves.
+        stalled: Replies since it stalled; 0 for a drive that moves.
     """
 
     limits: StuckLimits
@@ -72,6 +80,11 @@ class Drive:
         followed = self.followed or share >= FOLLOWING_SHARE
         return Drive(self.limits, replies, followed, int(followed and self._misses_step(replies)))
 
+    @property
+    def is_stuck(self) -> bool:
+        """Whether it stalled for so long that this is a fault."""
+        return self.stalled >= self.limits.replies
+
     def _advances(self, step: int) -> bool:
         """Whether the set-points move far enough, in the same direction as before."""
         before = self.replies[-1][1] - self.replies[0][1]
@@ -80,14 +93,17 @@ class Drive:
     def _window(self, replies: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
         """The window: replies without the oldest that are not needed."""
         demand = replies[-1][1]
-        while len(replies) > STUCK_CYCLES + 1 and abs(demand - replies[1][1]) >= self.limits.travel:
+        while (
+            len(replies) > self.limits.replies + 1
+            and abs(demand - replies[1][1]) >= self.limits.travel
+        ):
             replies = replies[1:]
         return replies
 
     def _share(self, replies: tuple[tuple[int, int], ...]) -> float | None:
         """Share of the set-points' travel that the drive made; None while it is too short."""
         (first, begin), (last, end) = replies[0], replies[-1]
-        if len(replies) <= STUCK_CYCLES or abs(end - begin) < self.limits.travel:
+        if len(replies) <= self.limits.replies or abs(end - begin) < self.limits.travel:
             return None
         return (last - first) / (end - begin)
 
@@ -109,16 +125,20 @@ class StuckWatch:
 
     drives: tuple[Drive, ...]
     names: tuple[str, ...]
+    may_disarm: bool = False
 
     @classmethod
-    def fresh(cls, limits: Sequence[StuckLimits], names: Sequence[str]) -> StuckWatch:
+    def fresh(
+        cls, limits: Sequence[StuckLimits], names: Sequence[str], *, may_disarm: bool = False
+    ) -> StuckWatch:
         """The initial state.
 
         Args:
             limits: One per drive.
             names: Of the drives.
+            may_disarm: As in `MonitorLimits`.
         """
-        return cls(tuple(Drive(each) for each in limits), tuple(names))
+        return cls(tuple(Drive(each) for each in limits), tuple(names), may_disarm)
 
     def update(
         self,
@@ -132,8 +152,8 @@ class StuckWatch:
         Args:
             following: Whether the drives follow set-points; otherwise nothing is judged.
             positions: Actual positions, [counts].
-            demands: Demanded positions at the time of those reports, [counts].
-            missing: True where a drive did not answer.
+            demands: Set-points of those reports, all of the same age, [counts].
+            missing: True where a drive sent no new position.
 
         Raises:
             ValueError: Not one entry per drive.
@@ -147,7 +167,13 @@ class StuckWatch:
         )
         each = zip(self.names, drives, missing, strict=True)
         found = [
-            stuck(number, name, drive.stalled, fault=drive.stalled >= STUCK_CYCLES)
+            stuck(
+                number,
+                name,
+                drive.stalled * drive.limits.period,
+                fault=drive.is_stuck,
+                may_disarm=self.may_disarm,
+            )
             for number, (name, drive, silent) in enumerate(each, start=1)
             if drive.stalled and not silent
         ]

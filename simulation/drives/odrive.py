@@ -304,7 +304,16 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         if not isinstance(document, OdriveDocument):
             raise TypeError("the rig has no ODrives")
         self._document = document
-        self._layouts = read_layouts(document.dbc)
+        layouts = self._layouts = read_layouts(document.dbc)
+        reports = (
+            layouts.heartbeat,
+            layouts.get_encoder_estimates,
+            layouts.get_torques,
+            layouts.get_version,
+            layouts.get_bus_voltage_current,
+            layouts.txsdo,
+        )
+        self._reports = frozenset(layout.command for layout in reports)
         self._since_update = self._since_set_point = 0.0
         # Drives that report more often than once a cycle do so at different positions.
         self._steps = max(1, math.ceil(rig.document.bus.cycle_ms / document.estimates_ms))
@@ -359,6 +368,8 @@ class SimulatedOdriveRig(SimulatedRig[SimulatedOdrive]):
         if message.is_extended_id or message.is_error_frame:
             return
         node, command = node_and_command(message.arbitration_id)
+        if message.data and command in self._reports:  # a drive's own, echoed by UDP multicast
+            return
         if node == BROADCAST:
             addressed = self.drives
         else:

@@ -158,6 +158,17 @@ def test_without_a_master_all_are_disarmed_together_by_their_watchdogs(bench: Od
     assert [drive.motor.position for drive in bench.drives] == began
 
 
+def test_frames_of_the_drives_that_the_bus_echoes_feed_no_watchdog() -> None:
+    """As over UDP multicast, which returns a sender its own frames."""
+    with odrive_bench() as bench:
+        bench.rehearsal._bus.receive_own_messages = True
+        bench.enable()
+        for _ in range(round(WATCHDOG_S / bench.rig.cycle) + 2):
+            bench.rehearsal.pump()
+        assert states(bench) == {AxisState.IDLE}
+        assert {drive.errors for drive in bench.drives} == {AxisError.WATCHDOG_TIMER_EXPIRED}
+
+
 @pytest.mark.parametrize("fed_by_reads", [True, False])
 def test_without_a_master_those_that_another_program_reads_may_stay_enabled(
     bench: OdriveBench, fed_by_reads: bool

@@ -38,6 +38,8 @@ class _Group:
         return SimpleNamespace(
             positions=HOME[0],
             demands=HOME[0],
+            set_points=HOME[0],
+            renewed=np.arange(10) != 4,
             torques=np.zeros(10, dtype=int),
             missing=np.arange(10) == 4,
             faults=self.faults,

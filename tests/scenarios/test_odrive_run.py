@@ -236,6 +236,68 @@ def test_a_drive_whose_position_is_often_overdue_ends_the_run_along_the_path(
     assert outcome.cause == said
 
 
+@pytest.mark.parametrize(
+    ("holding", "said"),
+    [
+        (
+            False,
+            "did not move for 2 cycles while its set-points advanced: it may be jammed or disarmed",
+        ),
+        (True, "all 8 cables carry no tension: they are broken or slack, or their drives are dis"),
+    ],
+)
+def test_an_emergency_stop_is_no_broken_cable(
+    prepared: PreparedRun, tmp_path: Path, holding: bool, said: str
+) -> None:
+    """Motion and tensions are missed before the next heartbeats give the reason."""
+
+    def press(stage: Any) -> None:
+        for drive in stage.drives:
+            drive.fail(AxisError.ESTOP_REQUESTED)
+
+    def script(stage: Any) -> None:
+        at(CRUISING - 50, lambda stage: stage.board.ask_hold(holding))(stage)
+        at(CRUISING, press)(stage)
+
+    with staged(prepared, tmp_path / "run", script) as (stage, _):
+        outcome = stage.run()
+        events = stage.events()
+    assert said in outcome.cause
+    assert any("emergency stop" in e.text for e in events if e.code == "drive_fault")
+
+
+@pytest.mark.parametrize(("drive", "estimates_ms"), [(2, 10), (4, 10), (2, 30), (2, 50)])
+def test_a_drive_that_jams_stops_the_run_before_its_cable_is_overloaded(
+    plan: Path, tmp_path: Path, drive: int, estimates_ms: float
+) -> None:
+    """Detected by its second position since; without the jam the same run reaches the goal."""
+    document = load_rig(ODRIVE).document
+    drives = document.drives.model_copy(update={"estimates_ms": estimates_ms})
+    rig = rig_from_document(document.model_copy(update={"drives": drives}))
+    prepared = prepare(verify(load_plan(plan), rig), rig)
+
+    def jam(stage: Any) -> None:
+        stage.drives[drive].motor.jammed = True
+
+    def with_a_hold(stage: Any) -> None:
+        at(CRUISING - 50, lambda stage: stage.board.ask_hold(True))(stage)
+        at(CRUISING, lambda stage: stage.board.ask_hold(False))(stage)
+        at(CRUISING + 20, lambda stage: stage.board.ask_speed(50))(stage)
+
+    with staged(prepared, tmp_path / "jammed", at(CRUISING, jam)) as (stage, _):
+        outcome = stage.run()
+        (stuck,) = (event for event in stage.events() if event.code == "drive_stuck")
+    period = round(estimates_ms / 10)
+    name, cycles = f"cable {drive + 1} (drive {drive + 1})", max(2, period)
+    assert outcome.cause.startswith(f"{name} did not move for {cycles} cycles"), outcome.cause
+    assert round(stuck.time_s / 0.01) - CRUISING <= 2 * period + 2
+    assert np.nanmax(outcome.log.table().tensions) < 102.0
+    with staged(prepared, tmp_path / "sound", with_a_hold) as (stage, _):
+        assert stage.run().state is State.FINISHED
+        codes = [event.code for event in stage.events()]
+    assert codes == ["enabled", "moving", "hold", "resume", "speed", "held"]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_a_fault_of_one_drive_is_a_hold_of_all_and_then_their_brakes(
     prepared: PreparedRun, tmp_path: Path, name: str

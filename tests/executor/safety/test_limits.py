@@ -10,7 +10,9 @@ from executor.safety.monitor import Monitor, Observation
 from executor.safety.stall import StuckLimits
 from executor.safety.sync_timeout import SyncAge
 from model.rig import load_rig, rig_from_document
-from tests.cli.plans import HALL, RIG
+from tests.cli.plans import CONFIGS, HALL, RIG
+
+ODRIVE_RIG = CONFIGS / "gachon_8_6_odrive.yaml"
 
 PER_MM = 131072 / 206.06
 """Counts a millimetre of cable of the paper's rig."""
@@ -62,6 +64,23 @@ def test_how_long_a_drive_may_stall_is_in_the_rig_file():
     )
     noisy = rig_from_document(rig.document.model_copy(update={"motion": motion}))
     assert stuck_limits(noisy, 0.01) == (StuckLimits(least=20, travel=274),) * 8
+
+
+def test_only_odrives_disarm_before_they_report_it():
+    assert monitor_limits(load_rig(ODRIVE_RIG), SyncAge()).may_disarm
+    assert not monitor_limits(load_rig(RIG), SyncAge()).may_disarm
+
+
+@pytest.mark.parametrize(
+    ("estimates_ms", "least", "period"),
+    [(1, 8, 1), (10, 8, 1), (19, 16, 1), (30, 24, 3), (50, 40, 5)],
+)
+def test_a_stalled_odrive_is_judged_from_position_to_position(estimates_ms, least, period):
+    """Slower set-points than 2 mm/s are not judged, whatever time lies between two of them."""
+    rig = load_rig(ODRIVE_RIG)
+    drives = rig.document.drives.model_copy(update={"estimates_ms": estimates_ms})
+    rare = rig_from_document(rig.document.model_copy(update={"drives": drives}))
+    assert stuck_limits(rare, 0.01) == (StuckLimits(least, 28, period),) * 8
 
 
 def test_counts_that_fall_when_cable_is_paid_out_have_the_same_limits():

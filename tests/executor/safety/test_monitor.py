@@ -258,6 +258,33 @@ def test_three_cycles_without_tension_in_a_row_are_a_quick_stop(drive, tension):
     )
 
 
+@pytest.mark.parametrize("may_disarm", [True, False])
+def test_loose_cables_may_be_those_of_drives_that_disarm_before_they_report_it(may_disarm):
+    def texts(*tensions: float) -> list[tuple[str, int]]:
+        watch = Monitor.fresh(replace(LIMITS, may_disarm=may_disarm), NAMES)
+        for _ in range(3):
+            watch, found = watch.update(replace(FINE, tensions=tensions))
+        assert {(each.code, each.reaction) for each in found} == {
+            ("cable_loose", StopReaction.QUICK_STOP)
+        }
+        return [(each.text, each.drive) for each in found]
+
+    one, all_of_them = [", or its drive is disarmed", ", or their drives are disarmed"]
+    none = "carries 0.0 N, no tension: it is broken or slack" + one * may_disarm
+    assert texts(0.0, 20.0, 0.0) == [(f"cable 1 {none}", 1), (f"cable 3 {none}", 3)]
+    every = "all 3 cables carry no tension: they are broken or slack" + all_of_them * may_disarm
+    assert texts(0.0, -1.0, 0.2) == [(every, 0)]
+
+
+@each_drive
+def test_all_cables_are_loose_as_soon_as_the_first_is_and_the_others_have_no_tension(drive):
+    none = replace(FINE, tensions=(0.0, 0.0, 0.0))
+    assert _look(*[none] * 2) == ()
+    later = replace(none, tensions=_put(none.tensions, drive, 20.0))
+    assert [alarm.drive for alarm in _look(later, none, none)] == [0]
+    assert len(_look(none, none, later)) == 2
+
+
 @each_drive
 @pytest.mark.parametrize("tension", [5.0, 100.0])
 def test_the_limits_of_tension_themselves_are_allowed(drive, tension):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -179,6 +180,50 @@ def test_drives_that_follow_nothing_are_not_judged():
     assert look([*cycles[:3], *resting, *cycles[3:]]) == ()
     assert look([*cycles[:3], *resting]) == (), "it would be stalled still if it were to follow"
     assert Drive(LIMITS, ((0, 0), (1, 1)), True, 3).forgotten() == Drive(LIMITS)
+
+
+@pytest.mark.parametrize(("period", "replies"), [(1, 2), (2, 1), (3, 1), (5, 1)])
+def test_a_reply_in_every_few_cycles_is_judged_by_the_cycles_it_covers(period, replies):
+    limits = StuckLimits(10, 100, period)
+    demands = [100 * period * k for k in range(8)]
+    positions = [min(demand, demands[4]) for demand in demands]
+    assert first_found(positions, demands, limits) == 4 + replies
+    (stop,) = look(list(steps(positions, demands))[: 5 + replies], limits)
+    assert stop.text == STOP.format(NAMES[0], max(2, period))
+    half = [demand // 2 for demand in demands]
+    assert first_found(half, demands, limits) is None
+    slow = [30 * k for k in range(20)]
+    held = [min(demand, slow[12]) for demand in slow]
+    assert first_found(held, slow, limits) == 16, "120 counts without motion"
+
+
+@given(
+    st.integers(1, 5),
+    st.floats(0.2, 5.0),
+    st.floats(0.0, 1.0),
+    st.randoms(use_true_random=False),
+)
+def test_a_drive_that_reports_at_its_own_moments_is_not_stalled(period, turn, rest, dice):
+    """To and fro with rests, 20 mm/s, positions up to a cycle old and in some cycles late."""
+    per_mm = 80.0
+    limits = StuckLimits(round(0.02 * period * per_mm), round(0.07 * per_mm), period)
+    speeds = np.sin(np.arange(0, 400) * 0.01 / turn * 2 * np.pi)
+    speeds[np.abs(speeds) < rest * 0.5] = 0.0
+    demands = np.cumsum(np.concatenate(([0.0] * 5, 0.2 * per_mm * speeds, [0.0] * 20)))
+    seen = range(3, len(demands), period)
+    asked = [round(demands[k]) for k in seen]
+    told = [round(np.interp(k - dice.random(), np.arange(len(demands)), demands)) for k in seen]
+    assert first_found(told, asked, limits) is None
+
+
+def test_a_drive_that_may_disarm_itself_may_not_be_jammed():
+    watch = StuckWatch.fresh((LIMITS,), NAMES[:1], may_disarm=True)
+    texts = []
+    for k in range(5):
+        watch, found = watch.update(True, (min(100 * k, 200),), (100 * k,), (False,))
+        texts += [alarm.text for alarm in found]
+    stop = STOP.format(NAMES[0], 2)
+    assert texts == [NOTE.format(NAMES[0]), f"{stop}: it may be jammed or disarmed"]
 
 
 def test_an_entry_is_needed_for_every_drive():
