@@ -388,7 +388,9 @@ class Loop:
             self._report("bus_lost", text)
             self._note_end(None)
             return
-        if before is None or (left.holding and left.stopped and not left.missing.any()):
+        # An ODrive is missing as well without a valid position, although its brake holds.
+        is_known = self._held == _BRAKED or not left.missing.any()
+        if before is None or (left.holding and left.stopped and is_known):
             return
         self._note_end(left)
         if lost := lost_states(self._rig, before, left, self._held_before, self.cause):

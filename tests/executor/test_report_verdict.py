@@ -196,7 +196,7 @@ def test_a_fault_is_failed_and_names_its_cause_even_when_notes_follow(
     assert "cable 4 jammed" in made["reasons"][0]
 
 
-FIRST = "cable 5 (drive 5): over-current; quick stop of all drives, fault latched"
+FIRST = "cable 5 (drive 5): over-current; quick stop of all drives"
 HOLDS = "cable 6 (drive 6) stopped on its own: quick stop active"
 UNHELD = "cable 4 (drive 4) restarted; drives still enabled: cable 3 (drive 3)"
 

@@ -295,12 +295,12 @@ SILENT = "cable 3 (drive 3) does not answer"
 @pytest.mark.parametrize(
     ("happens", "faults", "words"),
     [
-        (reports_no_number, 1, SILENT),
+        (reports_no_number, 1, ""),
         (CASES["no heartbeat"].happens, 1, SILENT),
         (CASES["cable pulled"].happens, None, ""),
     ],
 )
-def test_an_axis_that_is_not_heard_at_the_end_is_named_once(
+def test_an_axis_whose_state_is_not_heard_at_the_end_is_named_once(
     prepared: PreparedRun,
     tmp_path: Path,
     happens: Callable[[Any], object],
