@@ -102,6 +102,7 @@ class ReplyCheck:
         self._replies = [0] * count
         self._reasons: list[str] = [""] * count
         self._bad_cycles = [0] * count
+        self._texts = [""] * count  # of the faults, each as it was when it began
         self._repeats = [0] * count
 
     def forget_positions(self) -> None:
@@ -154,15 +155,17 @@ class ReplyCheck:
             bad + 1 if reason else 0
             for bad, reason in zip(self._bad_cycles, self._reasons, strict=True)
         ]
+        self._texts = [
+            (text or f"{reason}, {bad} cycles in a row") if bad >= BAD_CYCLES else ""
+            for text, reason, bad in zip(self._texts, self._reasons, self._bad_cycles, strict=True)
+        ]
 
     def faults(self) -> list[tuple[int, str]]:
         """Drives whose replies are unreliable, by node."""
         found = [
-            (node, f"{name}: {reason}, {bad} cycles in a row")
-            for (node, name), reason, bad in zip(
-                self._names, self._reasons, self._bad_cycles, strict=True
-            )
-            if bad >= BAD_CYCLES
+            (node, f"{name}: {text}")
+            for (node, name), text in zip(self._names, self._texts, strict=True)
+            if text
         ]
         found += [
             (node, f"{name} answered twice: two devices have this node id")

@@ -20,7 +20,6 @@ from executor.recording.record_files import free_folder
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from executor.recording.tables import CycleTable, PoseTable
 from executor.recording.verdict import faults_among
-from executor.safety.fault_messages import UNHELD
 from model.errors import BadInput, path_of
 from model.files.reading import TABLE_LIMIT
 from model.pages.page import html_table
@@ -30,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Why a file is missing where its disk, or the user's share of it, is full.
 _FULL = {os.strerror(number) for number in (errno.ENOSPC, errno.EDQUOT)}
+#: Codes of events after which drives may have no torque, so that its reset needs care.
+_RELEASES = ("drive_fault", "not_held")
 
 Columns = dict[str, NDArray[Any]]
 """A table of a run folder: read-only arrays of equal length by column name, with the unit in it.
@@ -106,7 +107,7 @@ class RunResult:
             return "check the report for exceeded limits before the next run"
         if self.summary.get("interface") == IN_PROCESS:
             return "find the cause, then run again into a new folder"
-        if not {event["code"] for event in self.summary["events"]}.isdisjoint(UNHELD):
+        if not {event["code"] for event in self.summary["events"]}.isdisjoint(_RELEASES):
             return (
                 "find the cause and check the platform; `cdpr status RIG` shows whether to run"
                 " `cdpr release RIG` or to press the emergency stop before `cdpr reset RIG`"

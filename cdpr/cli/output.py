@@ -21,18 +21,28 @@ out = Console(highlight=False, emoji=False)
 
 
 class _Remarks:
-    """Standard error that ignores a closed pipe, which must not end a run in motion."""
+    """Standard error that ignores a closed pipe or terminal: it must not end a run in motion."""
 
     def write(self, text: str) -> int:
         """Writes; errors are ignored."""
         with suppress(OSError, ValueError):
-            sys.stderr.write(text)
+            self._stream.write(text)
         return len(text)
 
     def flush(self) -> None:
         """Flushes; errors are ignored."""
         with suppress(OSError, ValueError):
-            sys.stderr.flush()
+            self._stream.flush()
+
+    @property
+    def rich_proxied_file(self) -> _Remarks:
+        """What rich writes to while it shows a bar: this, or an error would end the motion."""
+        return self
+
+    @property
+    def _stream(self) -> IO[str]:
+        """Standard error, also while rich has replaced it to keep a bar below the text."""
+        return cast(IO[str], getattr(sys.stderr, "rich_proxied_file", sys.stderr))
 
     def __getattr__(self, name: str) -> Any:
         """Everything else comes from standard error itself."""

@@ -11,6 +11,8 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from enum import Enum, auto
 
 import can
@@ -246,7 +248,11 @@ class OdriveGroup(CyclicGroup):
 
     def read_state(self, pace: Pace) -> CycleStatus:
         """Reads positions and states again; see `DriveGroup.read_state`."""
-        return self._read(pace, "position", "heartbeat")
+        with suppress(HardwareMissing):
+            return self._read(pace, "position", "heartbeat")
+        silent = np.array(self._watch.overdue("heartbeat")) | self._watch.missing
+        silent.setflags(write=False)
+        return replace(self._status(), missing=silent)
 
     def _arm(self) -> None:
         """Arms all drives once, and again those whose watchdog expired before they were fed.

@@ -18,7 +18,7 @@ from drivers.factory import holding_nodes, may_have_released
 from executor.control.cycle import SETTLING, Cycle, CycleResult, Feed, targets_at
 from executor.control.preconditions import require_at_start, require_capabilities, require_checked
 from executor.control.sync_master import SyncMaster, changed_states, hold_timeout_text, lost_states
-from executor.safety.fault_messages import UNHELD, Alarm, AlarmHistory, StopReaction, shared_causes
+from executor.safety.fault_messages import Alarm, AlarmHistory, StopReaction, shared_causes
 from executor.safety.gate import Purpose
 from executor.state_machine import ON_PATH, CycleRecord, Event, LoopEvent, Machine, State
 from executor.supervision import (
@@ -66,7 +66,6 @@ class Loop:
         self._path_stop = f"stopped {self.motion_phrase}"
         self._held = _HELD if self._group.capabilities.holds_on_quick_stop else _BRAKED
         self.cause = self._requested = self._listener_error = ""
-        self._unheld: list[str] = []  # texts of events on drives that may not hold
         self.error: CdprError | None = None
         """None here: the end of a run is reported by its cause."""
         self.holding = True
@@ -129,7 +128,6 @@ class Loop:
             raise
         if lost := self._sender.largest_share_lost:
             self._report("reply_lost", lost)
-        self.cause = "; ".join([self.cause, *(t for t in self._unheld if t not in self.cause)])
         return self.machine.state
 
     def _one_step(self) -> None:
@@ -199,7 +197,8 @@ class Loop:
             if status is not None and status.stopped and (status.holding or not was_enabled):
                 self._leave(status)
                 return
-        self._fault("hold_timeout", hold_timeout_text(self._rig, status, within))
+        text = hold_timeout_text(self._rig, status, within, was_enabled=was_enabled)
+        self._fault("hold_timeout", text)
 
     def _leave(self, held: CycleStatus) -> None:
         """Ends monitoring of drives that hold on their own, and reads their state again."""
@@ -389,11 +388,14 @@ class Loop:
             self._report("bus_lost", text)
             self._note_end(None)
             return
-        if before is None or (left.holding and left.stopped and not left.missing.any()):
+        # An ODrive is missing as well without a valid position, although its brake holds.
+        is_known = self._held == _BRAKED or not left.missing.any()
+        if before is None or (left.holding and left.stopped and is_known):
             return
         self._note_end(left)
-        if otherwise := lost_states(self._rig, before, left, (self.cause, *self._unheld)):
-            self._report("not_held", otherwise)
+        if lost := lost_states(self._rig, before, left, self._held_before, self.cause):
+            self._report("not_held", lost)
+            self.cause += "" if lost in self.cause else f"; {lost}"
 
     def _one_more_latched(self) -> bool:
         """Sends a cycle after a fault; false when the gate denies it, as it then always will.
@@ -432,8 +434,6 @@ class Loop:
             self.cause = text
 
     def _report(self, code: str, text: str) -> None:
-        if code in UNHELD:
-            self._unheld.append(text)
         event = LoopEvent(self._cycle, self._clock.time, code, text)
         self._call_listener(lambda: self._calls.on_event(event))
 

@@ -307,35 +307,75 @@ def changed_states(
     return "; ".join(found)
 
 
-def lost_states(rig: Rig, before: CycleStatus, after: CycleStatus, reported: Sequence[str]) -> str:
-    """`changed_states` after a stop, without drives that hold, never held or are reported.
+def lost_states(
+    rig: Rig, before: CycleStatus, after: CycleStatus, held: Collection[int], cause: str
+) -> str:
+    """Names the drives that may not hold after a stop, as their states show; empty for none.
+
+    They are still enabled, hold no longer, or do not answer.
 
     Args:
         rig: The robot.
         before: As for `changed_states`.
         after: As for `changed_states`.
-        reported: Texts on this stop so far.
+        held: Nodes of the drives that have held their cables at some time.
+        cause: Of the stop; what it states of a drive is not repeated.
     """
-    names, texts = tuple(rig.drive_names.values()), "; ".join(reported)
-    everyone, _ = name_drives(names, len(names))
-    excluded = []
-    for drive, (held, holds) in enumerate(
-        zip(*(stop_alone(rig, s.status_words.tolist()) for s in (before, after)), strict=True)
-    ):
-        is_reported = names[drive] in texts or everyone in texts
-        known = is_reported if before.missing[drive] else not held
-        if known or (holds and not after.missing[drive]):
+    words = before.status_words.tolist(), after.status_words.tolist()
+    before_holds, holds = (stop_alone(rig, each) for each in words)
+    was_enabled, is_enabled = (
+        [flags.torque == "enabled" for flags in drive_flags(rig, each)] for each in words
+    )
+    states = drive_states(rig, words[1])
+    excluded, released = [], []
+    for drive, (node, name) in enumerate(rig.drive_names.items()):
+        if after.missing[drive]:
+            if node not in held or _is_silent_in(cause, name, rig):
+                excluded.append(drive)
+            continue
+        faults = [text for at, text in after.faults if at == node]
+        unknown = [text for text in faults if text not in cause]
+        is_known = holds[drive] or node not in held or f"{name} went from" in cause
+        if is_known or is_enabled[drive]:
+            excluded.append(drive)  # one that is still enabled is named nevertheless
+        elif not (before_holds[drive] or was_enabled[drive]):
             excluded.append(drive)
-    return changed_states(rig, before, after, excluded)
+            released += unknown if faults else [f"{name} is in {states[drive]}"]
+    changed = changed_states(rig, before, after, excluded)
+    return "; ".join([*released, *([changed] if changed else [])])
 
 
-def hold_timeout_text(rig: Rig, status: CycleStatus | None, within: float) -> str:
-    """States that drives did not hold within a time [s]: which, and which replies are missing."""
+def _is_silent_in(cause: str, name: str, rig: Rig) -> bool:
+    """Whether a cause states that this drive did not answer, or that none did."""
+    everyone, _ = name_drives(names := [*rig.drive_names.values()], len(names))
+    clauses = [part.partition(" did not answer for ") for part in cause.split("; ")]
+    silent = [subject for subject, verb, _ in clauses if verb]
+    return f"{name} does not answer" in cause or any(
+        name in subject or everyone in subject for subject in silent
+    )
+
+
+def hold_timeout_text(
+    rig: Rig, status: CycleStatus | None, within: float, *, was_enabled: bool
+) -> str:
+    """States that drives did not hold within a time: which, and which replies are missing.
+
+    Args:
+        rig: The robot.
+        status: Of the last cycle.
+        within: The time, [s].
+        was_enabled: Of all drives; otherwise each that follows no set-points has stopped.
+    """
     texts = [f"the drives did not hold within {within:.3g} s"]
     if status is not None:
         words, names = status.status_words.tolist(), tuple(rig.drive_names.values())
-        rows = zip(names, drive_states(rig, words), stop_alone(rig, words), strict=True)
-        texts += [f"{name} is in {state}" for name, state, holds in rows if not holds]
+        ended = (
+            stop_alone(rig, words)
+            if was_enabled
+            else [flags.torque != "enabled" for flags in drive_flags(rig, words)]
+        )
+        rows = zip(names, drive_states(rig, words), ended, strict=True)
+        texts += [f"{name} is in {state}" for name, state, has_ended in rows if not has_ended]
         if silent := list(compress(names, status.missing.tolist())):
             texts.append(f"no reply from {', '.join(silent)} in the last cycle")
     return "; ".join(texts)

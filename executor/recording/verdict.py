@@ -14,7 +14,7 @@ from executor.recording.clearance import ClearanceTable, camera_of, source_of
 from executor.recording.record_files import CameraRecord, RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
-from executor.safety.fault_messages import LARGEST_SHARE, NO_MORE, UNHELD
+from executor.safety.fault_messages import LARGEST_SHARE, NO_MORE
 from executor.safety.limits import tension_limits
 from executor.state_machine import REMARK, SIMULATED, State
 from model.errors import BadInput
@@ -153,7 +153,7 @@ def judge(
 def _cause(context: RunContext) -> tuple[str, list[Check]]:
     """Why a run did not finish, and a failed check if besides that drives may not hold."""
     cause = context.course.cause or next((event.text for event in reversed(context.events)), "")
-    texts = [*dict.fromkeys(event.text for event in context.events if event.code in UNHELD)]
+    texts = [*dict.fromkeys(context.texts_of("not_held"))]
     for text in reversed(texts):  # the latch keeps all, see `Loop`
         cause = cause.removesuffix(f"; {text}")
     later = "; ".join(text for text in texts if text not in cause)

@@ -133,8 +133,6 @@ def late(cycles: float, *, too_late: bool) -> Alarm:
     return Alarm(reaction, "late", f"a cycle began {cycles:.1f} cycles late")
 
 
-#: Codes of events that name drives which may not hold their cables.
-UNHELD = ("drive_fault", "not_held")
 #: Events of one note, such as the missed set-points of one drive, in a motion: a disturbed bus
 #: would fill the record with more.
 NOTE_EVENTS = 10

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import sys
 import termios
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,6 +23,7 @@ from hypothesis import strategies as st
 from cdpr.cli.operate import jog, monitor
 from cdpr.cli.operate.jog import JogKeys
 from cdpr.cli.operate.supervision import NAMES, Keys, SignalSupervisor, names_of
+from cdpr.cli.output import Terminal, progress_bar
 from executor.hold_to_run.line import JogProver
 from executor.hold_to_run.presses import TIMEOUT, PressBoard
 from executor.hold_to_run.session import jog_session
@@ -121,9 +123,9 @@ class Typed:
         return [key for begin, end, key in self._script if begin <= self.now < end]
 
 
-def jogged(script: Sequence[tuple[float, float, str]]) -> list[tuple[float, Any]]:
+def jogged(script: Sequence[tuple[float, float, str]] | Typed) -> list[tuple[float, Any]]:
     """Time and position of the platform in every cycle once the drives are ready."""
-    typed, seen = Typed(script), []
+    typed, seen = script if isinstance(script, Typed) else Typed(script), []
     keys = JogKeys(typed, 20.0)  # type: ignore[arg-type]
     begun: list[float] = []
 
@@ -204,6 +206,51 @@ def test_the_speed_that_is_shown_is_that_of_the_session(
 def test_space_stops_the_session_while_it_moves() -> None:
     with pytest.raises(StoppedByOperator):
         jogged([(1.0, 9.0, "right"), (1.5, 1.51, " ")])
+
+
+class Closing(Typed):
+    """The terminal is closed at a time: from then on it raises whenever it is used."""
+
+    def pressed(self, wait: float = 0.0) -> list[str]:
+        if self.now >= 1.5:
+            assert not self.was_closed, "it is not used again"
+            self.was_closed = True
+            raise OSError(errno.EIO, "Input/output error")
+        return super().pressed(wait)
+
+    was_closed = False
+
+
+def test_a_terminal_that_is_closed_in_a_jog_is_the_operators_stop(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StoppedByOperator):
+        jogged(Closing([(1.0, 9.0, "right")]))
+
+
+@pytest.mark.parametrize("shown", [False, True])
+def test_text_for_a_closed_terminal_ends_no_motion_even_while_a_bar_is_shown(
+    monkeypatch: pytest.MonkeyPatch, shown: bool
+) -> None:
+    closed = Mock(spec=["write", "flush", "isatty", "encoding"], encoding="utf-8")
+    closed.isatty.return_value = True
+    closed.write.side_effect = OSError(errno.EIO, "Input/output error")
+    monkeypatch.setattr(sys, "stderr", closed)
+    monkeypatch.setenv("TERM", "xterm")
+    with progress_bar("moving", 10.0, shown=True) if shown else nullcontext():
+        Terminal().note("stop requested")
+    assert closed.write.called
+
+
+def test_a_closed_terminal_has_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    operator, program = pty.openpty()
+    with os.fdopen(program) as stream:
+        monkeypatch.setattr(sys, "stdin", stream)
+        keys = Keys()
+        os.close(operator)
+        with pytest.raises(OSError, match=r"Input/output error|closed"):
+            keys.pressed(wait=10.0)
 
 
 class Script:

@@ -359,9 +359,10 @@ def test_silence_counts_in_a_row_and_stays(missed: list[int], silent: bool) -> N
 HELD, FAILED, ENABLED = 0x0607, 0x0218, 0x0627
 
 
-def reported(words: Sequence[int], silent: Sequence[int] = ()) -> Any:
+def reported(words: Sequence[int], silent: Sequence[int] = (), faults: Sequence[str] = ()) -> Any:
     missing = np.array([drive in silent for drive in range(8)])
-    return SimpleNamespace(status_words=np.array(words), missing=missing)
+    of_the_last = [(8, text) for text in faults]
+    return SimpleNamespace(status_words=np.array(words), missing=missing, faults=of_the_last)
 
 
 @pytest.mark.parametrize(
@@ -418,27 +419,73 @@ def test_a_drive_that_is_still_enabled_is_named_even_if_it_was_so_before(
     [
         (HELD, [], [7], "", "does not answer"),
         (HELD, [7], [7], "", "does not answer"),
-        (HELD, [7], [7], "cable 8 (drive 8) did not answer", ""),
-        (HELD, [7], [7], "all 8 drives did not answer", ""),
+        (HELD, [7], [7], "cable 8 (drive 8) did not answer for 2 cycles", ""),
+        (HELD, [7], [7], "all 8 drives did not answer for 2 cycles", ""),
         (HELD, [], [7], "cable 8 (drive 8): hot", "does not answer"),
+        (HELD, [7], [7], "cable 7 (drive 7), cable 8 (drive 8) did not answer for 2 cycles", ""),
+        (HELD, [7], [7], "cable 8 (drive 8) did not move for 2 cycles", "does not answer"),
+        (HELD, [7], [7], "cable 8 (drive 8) did not answer in 10 of the last 50 cycles", "answer"),
+        (ENABLED, [], [7], "", "does not answer"),
         (ENABLED, [7], [], "", ""),
-        (0x0240, [], [7], "", ""),
+        (0x0240, [], [7], "", "does not answer"),
     ],
-    ids=["late", "unnamed", "named", "all named", "held on", "heard again", "never held"],
 )
-def test_after_a_stop_only_drives_that_no_report_names_are_added(
+def test_after_a_stop_silent_drives_are_added_that_its_cause_does_not_name_as_silent(
     before: int, silent_before: list[int], silent: list[int], said: str, expected: str
 ) -> None:
     words = [HELD] * 7
     earlier = reported([*words, before], silent_before)
-    found = lost_states(THE_RIG, earlier, reported([*words, HELD], silent), ["hot", said])
+    after = reported([*words, HELD if before == ENABLED and not silent else before], silent)
+    found = lost_states(THE_RIG, earlier, after, range(1, 9), f"hot; {said}; quick stop")
     assert found.endswith(expected) if expected else not found
+    assert not lost_states(THE_RIG, earlier, after, range(1, 8), said), "it never held"
+
+
+OFF = 0x0240
+OWN = "cable 8 (drive 8) stopped on its own: quick stop active"
+HOT = "cable 8 (drive 8): hot"
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "faults", "cause", "expected"),
+    [
+        (HELD, HELD, [OWN], "", ""),
+        (FAILED, FAILED, [HOT], "", HOT),
+        (FAILED, FAILED, [HOT], HOT, ""),
+        (FAILED, FAILED, [OWN, HOT], OWN, HOT),
+        (
+            HELD,
+            FAILED,
+            [OWN],
+            OWN,
+            "drives left the state they held in: cable 8 (drive 8) went from quick stop active to"
+            " fault",
+        ),
+        (OFF, OFF, [], "", "cable 8 (drive 8) is in switch on disabled"),
+        (ENABLED, ENABLED, [HOT], HOT, "drives still enabled: cable 8 (drive 8)"),
+    ],
+)
+def test_after_a_stop_a_drive_may_not_hold_by_its_state_whatever_was_reported(
+    before: int, after: int, faults: list[str], cause: str, expected: str
+) -> None:
+    words = [HELD] * 7
+    found = reported([*words, after], faults=faults)
+    earlier = reported([*words, before])
+    assert lost_states(THE_RIG, earlier, found, range(1, 9), f"{cause}; quick stop") == expected
 
 
 def test_a_time_out_names_drives_that_do_not_hold_and_missing_replies() -> None:
     status = reported([*[HELD] * 6, ENABLED, HELD], [2, 3])
-    assert hold_timeout_text(THE_RIG, status, 3.0) == (
+    assert hold_timeout_text(THE_RIG, status, 3.0, was_enabled=True) == (
         "the drives did not hold within 3 s; cable 7 (drive 7) is in operation enabled; no reply"
         " from cable 3 (drive 3), cable 4 (drive 4) in the last cycle"
     )
-    assert hold_timeout_text(THE_RIG, None, 3.0) == "the drives did not hold within 3 s"
+    none = hold_timeout_text(THE_RIG, None, 3.0, was_enabled=True)
+    assert none == "the drives did not hold within 3 s"
+
+
+def test_a_time_out_while_enabling_names_only_drives_that_stay_enabled() -> None:
+    status = reported([*[OFF] * 6, ENABLED, 0x0233])
+    assert hold_timeout_text(THE_RIG, status, 3.0, was_enabled=False) == (
+        "the drives did not hold within 3 s; cable 7 (drive 7) is in operation enabled"
+    )

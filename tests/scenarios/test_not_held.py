@@ -398,6 +398,42 @@ def test_a_second_drive_that_does_not_hold_is_named_with_what_to_do(
     assert check["text"] == second
 
 
+def both_stop_alone(stage: Stage) -> None:
+    if stage.cycle == CRUISING:
+        for drive in (FIFTH, SIXTH):
+            stage.drives[drive]._connection_lost(0x8130)
+
+
+def test_drives_that_stopped_on_their_own_and_hold_are_no_reason_for_an_emergency_stop(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", both_stop_alone) as stage:
+        outcome = stage.run()
+        summary = concluded(stage, outcome)
+        codes = [event.code for event in stage.events()]
+    assert codes.count("drive_fault") == 2
+    assert "held" not in [check["name"] for check in summary["checks"]]
+    assert "drive 6" not in outcome.cause
+
+
+def jams_and_dies(stage: Stage) -> None:
+    if stage.cycle == CRUISING:
+        stage.drives[FIFTH].motor.jammed = True
+    if stage.recorder is not None and stage.recorder.state is State.LATCHED:
+        stage.drives[FIFTH].silent = True
+
+
+def test_a_drive_that_dies_in_the_stop_is_named_although_it_caused_the_stop(
+    prepared: PreparedRun, tmp_path: Path
+) -> None:
+    with staged(prepared, tmp_path / "run", jams_and_dies) as stage:
+        outcome = stage.run()
+        summary = concluded(stage, outcome)
+    assert outcome.cause.startswith("cable 5 (drive 5) did not move")
+    (check,) = (check for check in summary["checks"] if check["name"] == "held")
+    assert "cable 5 (drive 5) does not answer" in check["text"]
+
+
 THREE_LINES = Fault("frames cannot be sent", where="can0", why="it is down", next_step="set it up")
 OF_THE_LIBRARY = can.CanOperationError("Network is down [Error Code 100]")
 

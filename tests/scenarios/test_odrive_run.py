@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,7 +29,7 @@ from planner.check import verify
 from simulation.drives.odrive import SimulatedOdriveRig
 from tests.cli.plans import CONFIGS, GOAL_MM, START_MM, free_scene, straight_plan
 from tests.cli.program import call, nothing_written
-from tests.scenarios.stage import Stage, at
+from tests.scenarios.stage import Stage, at, concluded
 
 ODRIVE = CONFIGS / "gachon_8_6_odrive.yaml"
 CRUISING = 150
@@ -326,6 +327,60 @@ def test_a_fault_of_one_drive_is_a_hold_of_all_and_then_their_brakes(
     assert (others.all(axis=1) | ~others.any(axis=1)).all(), "the others never one alone"
     held = int(others[noticed:].all(axis=1).sum())
     assert HELD_CYCLES <= held <= HELD_CYCLES + 3
+
+
+def reports_no_number(stage: Any) -> None:
+    drive = stage.drives[2]
+    sent = drive._send
+
+    def send(layout: Any, *values: float) -> None:
+        is_position = layout is drive._layouts.get_encoder_estimates
+        sent(layout, *([math.nan] * 2 if is_position else values))
+
+    drive._send = send
+
+
+DISARMED = ("watchdog", "restarts", "emergency stop of one")
+
+
+@pytest.mark.parametrize("happens", [CASES[name].happens for name in DISARMED], ids=DISARMED)
+def test_an_axis_that_is_idle_at_the_end_is_held_by_its_brake(
+    prepared: PreparedRun, tmp_path: Path, happens: Callable[[Any], object]
+) -> None:
+    with staged(prepared, tmp_path / "run", at(CRUISING, happens)) as (stage, _):
+        outcome = stage.run()
+        summary = concluded(stage, outcome)
+    assert "drive_fault" in [event["code"] for event in summary["events"]]
+    assert not [reason for reason in summary["reasons"] if "may not hold" in reason]
+
+
+SILENT = "cable 3 (drive 3) does not answer"
+
+
+@pytest.mark.parametrize(
+    ("happens", "faults", "words"),
+    [
+        (reports_no_number, 1, ""),
+        (CASES["no heartbeat"].happens, 1, SILENT),
+        (CASES["cable pulled"].happens, None, ""),
+    ],
+)
+def test_an_axis_whose_state_is_not_heard_at_the_end_is_named_once(
+    prepared: PreparedRun,
+    tmp_path: Path,
+    happens: Callable[[Any], object],
+    faults: int | None,
+    words: str,
+) -> None:
+    """Unless the cause states it; the bus is not lost."""
+    with staged(prepared, tmp_path / "run", at(CRUISING, happens)) as (stage, _):
+        outcome = stage.run()
+        codes = [event.code for event in stage.events()]
+        summary = concluded(stage, outcome)
+    assert faults is None or codes.count("drive_fault") == faults
+    assert "bus_lost" not in codes
+    held = [check["text"] for check in summary["checks"] if check["name"] == "held"]
+    assert [words in text for text in held] == ([True] if words else [])
 
 
 def changed_rig(tmp_path: Path, brake: bool = True, **drives: Any) -> Path:

@@ -268,7 +268,7 @@ class JogKeys:
         self._read_at = float("inf")
         self._live = Live(console=err, auto_refresh=False, transient=True)
         self._stack = ExitStack()
-        self._is_ready = False
+        self._is_ready = self._is_closed = False
 
     def __enter__(self) -> JogKeys:
         """Leaves the terminal unchanged until the drives are ready."""
@@ -279,9 +279,16 @@ class JogKeys:
         self._stack.close()
 
     def take_cycle(self, record: CycleRecord, presses: PressBoard, prover: JogProver) -> None:
-        """After a cycle: reads the keys, and shows the platform's position."""
-        if record.state is not State.MOVING:
+        """After a cycle: reads the keys, and shows the position; a closed terminal is a stop."""
+        if record.state is not State.MOVING or self._is_closed:
             return
+        try:
+            self._use_terminal(record, presses, prover)
+        except OSError:
+            self._is_closed = True
+            signal.raise_signal(signal.SIGINT)  # as Ctrl-C
+
+    def _use_terminal(self, record: CycleRecord, presses: PressBoard, prover: JogProver) -> None:
         if not self._is_ready:
             self._is_ready = True
             self._stack.enter_context(self._keys)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import select
@@ -273,10 +274,16 @@ class Keys:
 
         Args:
             wait: Longest wait for the first one, [s].
+
+        Raises:
+            OSError: The terminal was closed.
         """
         if not select.select([self._input], [], [], wait)[0]:
             return []
-        return list(names_of(os.read(self._input, _CHUNK)))
+        data = os.read(self._input, _CHUNK)
+        if not data:  # what a closed terminal returns instead of an error, by its kind
+            raise OSError(errno.EIO, "the terminal was closed")
+        return list(names_of(data))
 
 
 def names_of(data: bytes) -> list[str]:
