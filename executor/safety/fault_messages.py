@@ -83,11 +83,12 @@ def cable_loose(cable: int, tension: float, may_disarm: bool) -> Alarm:
     return Alarm(StopReaction.QUICK_STOP, "cable_loose", text, cable)
 
 
-def all_loose(cables: int, may_disarm: bool) -> Alarm:
-    """No cable has any tension; see `cable_loose`."""
-    text = f"all {cables} cables carry no tension: they are broken or slack"
-    if may_disarm:
-        text += ", or their drives are disarmed"
+def all_loose(cables: int) -> Alarm:
+    """No cable has any tension, and drives disarm before they report it; see `cable_loose`."""
+    text = (
+        f"all {cables} cables carry no tension: they are broken or slack,"
+        " or their drives are disarmed"
+    )
     return Alarm(StopReaction.QUICK_STOP, "cable_loose", text)
 
 

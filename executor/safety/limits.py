@@ -22,7 +22,7 @@ LOOSE_SHARE = 0.1
 #: Set-points and positions are whole counts: together a noise of one count. A drive is judged
 #: over at least 8/3 of the noise. See `executor.safety.stall`.
 LEAST_TRAVEL = 3
-#: A step of one count may be rounding alone, [counts].
+#: A step of one count from reply to reply may be rounding alone, [counts].
 LEAST_STEP = 2
 #: Above this share of the largest planned tension a cable is overloaded; torque is read in ‰.
 OVERLOAD_SHARE = 1.02
@@ -60,14 +60,14 @@ def stuck_limits(rig: Rig, cycle: float) -> tuple[StuckLimits, ...]:
         cycle: [s].
     """
     drives = rig.document.drives
-    period = drives.estimates_ms / 1000.0 if isinstance(drives, OdriveDocument) else cycle
-    period = max(cycle, period)
-    step, travel = rig.motion.stuck_speed * period, rig.motion.stuck_travel
+    reply = drives.estimates_ms / 1000.0 if isinstance(drives, OdriveDocument) else cycle
+    period = math.floor(max(cycle, reply) / cycle + 1e-9)
+    step, travel = rig.motion.stuck_speed * cycle, rig.motion.stuck_travel
     return tuple(
         StuckLimits(
-            least=max(LEAST_STEP, math.ceil(step * abs(winch.counts_per_metre))),
+            least=max(LEAST_STEP / period, step * abs(winch.counts_per_metre)),
             travel=max(LEAST_TRAVEL, math.ceil(travel * abs(winch.counts_per_metre))),
-            period=math.floor(period / cycle + 1e-9),
+            period=period,
         )
         for winch in rig.winches
     )

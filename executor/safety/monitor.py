@@ -199,8 +199,8 @@ class Monitor:
     def _tensions(self, seen: Observation) -> list[Alarm]:
         limits, found = self.limits, []
         loose = [count >= limits.loose_cycles for count in self.loose]
-        if len(loose) > 1 and any(loose) and all(self.loose):  # not all of them in the same cycle
-            return [fault_messages.all_loose(len(loose), limits.may_disarm)]
+        if limits.may_disarm and any(loose) and all(self.loose):  # not all in the same cycle
+            return [fault_messages.all_loose(len(loose))]
         for drive, tension in enumerate(seen.tensions):
             cable = drive + 1
             if loose[drive]:

@@ -12,7 +12,8 @@ that share by 2 n / travel. So with the shares below
                        `travel` (and two cycles) without it
 
 Only motion in one direction is judged, above a speed that friction may absorb (`least`), and only
-of a drive that has followed since: at the start of a motion a servo lags.
+of a drive that has followed since: at the start of a motion a servo lags. A drive that is ahead of
+its set-points, as a servo may be after they slowed down, waits for them and has not stalled.
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ class StuckLimits:
     """Stall limits of one drive.
 
     Attributes:
-        least: Smaller set-point steps from reply to reply are not judged, [counts].
+        least: Slower set-points are not judged, [counts per cycle].
         travel: Travel of the set-points over which a drive is judged, [counts].
-        period: Cycles from reply to reply.
+        period: Cycles from reply to reply, at least.
     """
 
-    least: int
+    least: float
     travel: int
     period: int = 1
 
@@ -60,12 +61,18 @@ class Drive:
         replies: Position and demand of each reply in the window, [counts]; the oldest first.
         followed: It has followed; a drive that has not yet begun to move is not judged.
         stalled: Replies since it stalled; 0 for a drive that moves.
+        silent: Cycles since its last reply.
     """
 
     limits: StuckLimits
     replies: tuple[tuple[int, int], ...] = ()
     followed: bool = False
     stalled: int = 0
+    silent: int = 0
+
+    def unseen(self) -> Drive:
+        """The state after a cycle without a reply."""
+        return replace(self, silent=self.silent + 1)
 
     def seen(self, position: int, demand: int) -> Drive:
         """The state after one more reply."""
@@ -75,10 +82,12 @@ class Drive:
         share = self._share(replies)
         if share is None:  # `followed` is False here: once set, the window is never too short again
             return Drive(self.limits, replies)
-        if self.followed and share < STALLED_SHARE:
+        is_behind = (demand - position) * (demand - replies[0][1]) > 0
+        if self.followed and is_behind and share < STALLED_SHARE:
             return Drive(self.limits, replies, True, len(replies) - 1)
         followed = self.followed or share >= FOLLOWING_SHARE
-        return Drive(self.limits, replies, followed, int(followed and self._misses_step(replies)))
+        misses_step = followed and is_behind and self._misses_step(replies)
+        return Drive(self.limits, replies, followed, int(misses_step))
 
     @property
     def is_stuck(self) -> bool:
@@ -88,7 +97,7 @@ class Drive:
     def _advances(self, step: int) -> bool:
         """Whether the set-points move far enough, in the same direction as before."""
         before = self.replies[-1][1] - self.replies[0][1]
-        return abs(step) >= self.limits.least and step * before >= 0
+        return abs(step) >= self.limits.least * (self.silent + 1) and step * before >= 0
 
     def _window(self, replies: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
         """The window: replies without the oldest that are not needed."""
@@ -162,7 +171,7 @@ class StuckWatch:
             return replace(self, drives=tuple(drive.forgotten() for drive in self.drives)), ()
         rows = zip(self.drives, positions, demands, missing, strict=True)
         drives = tuple(
-            drive if silent else drive.seen(position, demand)
+            drive.unseen() if silent else drive.seen(position, demand)
             for drive, position, demand, silent in rows
         )
         each = zip(self.names, drives, missing, strict=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -110,13 +112,48 @@ def test_turning_round_by_a_single_count_ends_the_stretch():
     assert drive.seen(2, 2).replies == ((0, 0), (1, 1), (2, 2))
 
 
-@pytest.mark.parametrize("off", [-5000, 5000])
+@pytest.mark.parametrize(("ahead", "found"), [(-5000, 6), (0, 6), (100, 6), (250, 7), (350, 8)])
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_drive_that_is_behind_or_ahead_is_judged_by_its_motion_alone(off, sign):
+def test_a_drive_that_is_behind_is_judged_at_once_and_one_that_is_ahead_once_it_is_passed(
+    ahead, found, sign
+):
     demands = [sign * 100 * k for k in range(10)]
-    assert first_found([demand + off for demand in demands], demands) is None
-    jammed = [sign * 100 * min(k, 4) + off for k in range(10)]
-    assert first_found(jammed, demands) == 6
+    assert first_found([demand + sign * ahead for demand in demands], demands) is None
+    jammed = [sign * (100 * min(k, 4) + ahead) for k in range(10)]
+    assert first_found(jammed, demands) == found
+
+
+@pytest.mark.parametrize(
+    ("limits", "replies"),
+    [
+        (
+            StuckLimits(8, 28, 1),
+            "81,0 111,34 134,60 150,80 159,96 165,108 167,118 168,127 169,136",
+        ),
+        (
+            StuckLimits(8, 28, 2),
+            "75,0 288,206 448,365 559,477 631,552 668,598 683,626 686,645 689,662",
+        ),
+    ],
+)
+def test_a_servo_that_is_ahead_after_slowing_down_waits_and_has_not_stalled(limits, replies):
+    """From 100 to 2.2 mm/s in a position loop with lag."""
+    positions, demands = zip(*(map(int, each.split(",")) for each in replies.split()), strict=True)
+    assert first_found(positions, demands, limits) is None
+
+
+@pytest.mark.parametrize("gaps", [(1, 2), (2, 1, 1), (2, 3), (1,)])
+def test_a_jam_is_found_also_where_gaps_between_replies_vary(gaps):
+    """At 2.5 mm/s, of which 2 are judged."""
+    watch = StuckWatch.fresh((StuckLimits(8, 28),), NAMES[:1])
+    replies = set(itertools.accumulate(itertools.islice(itertools.cycle(gaps), 200)))
+    stuck = []
+    for cycle in range(120):
+        row = (True, (10 * min(cycle, 60),), (10 * cycle,), (cycle not in replies,))
+        watch, found = watch.update(*row)
+        stuck += [cycle for alarm in found if alarm.code == "drive_stuck"]
+    assert stuck
+    assert 60 < stuck[0] <= 60 + 3 + 2 * max(gaps)
 
 
 @pytest.mark.parametrize(("moved", "found"), [(49, 1), (50, 0), (0, 1), (-25, 1), (-200, 1)])
@@ -206,7 +243,7 @@ def test_a_reply_in_every_few_cycles_is_judged_by_the_cycles_it_covers(period, r
 def test_a_drive_that_reports_at_its_own_moments_is_not_stalled(period, turn, rest, dice):
     """To and fro with rests, 20 mm/s, positions up to a cycle old and in some cycles late."""
     per_mm = 80.0
-    limits = StuckLimits(round(0.02 * period * per_mm), round(0.07 * per_mm), period)
+    limits = StuckLimits(0.02 * per_mm, round(0.07 * per_mm), period)
     speeds = np.sin(np.arange(0, 400) * 0.01 / turn * 2 * np.pi)
     speeds[np.abs(speeds) < rest * 0.5] = 0.0
     demands = np.cumsum(np.concatenate(([0.0] * 5, 0.2 * per_mm * speeds, [0.0] * 20)))
