@@ -134,7 +134,7 @@ class StuckWatch:
 
     drives: tuple[Drive, ...]
     names: tuple[str, ...]
-    may_disarm: bool = False
+    may_disarm: bool
 
     @classmethod
     def fresh(

@@ -73,7 +73,9 @@ def test_only_odrives_disarm_before_they_report_it():
     assert not monitor_limits(load_rig(RIG), SyncAge()).may_disarm
 
 
-@pytest.mark.parametrize(("estimates_ms", "period"), [(1, 1), (10, 1), (19, 1), (30, 3), (50, 5)])
+@pytest.mark.parametrize(
+    ("estimates_ms", "period"), [(1, 1), (10, 1), (19, 1), (29.98, 2), (30, 3), (50, 5)]
+)
 def test_a_stalled_odrive_is_judged_from_position_to_position(estimates_ms, period):
     """Slower set-points than 2 mm/s are not judged, whatever time lies between two of them."""
     rig = load_rig(ODRIVE_RIG)

@@ -142,6 +142,27 @@ def test_a_servo_that_is_ahead_after_slowing_down_waits_and_has_not_stalled(limi
     assert first_found(positions, demands, limits) is None
 
 
+def test_a_step_is_missed_only_by_a_drive_that_is_behind():
+    """Ahead by more than a step, as after set-points that slowed down."""
+    demands = [100 * k for k in range(6)]
+    assert look(list(steps([d + 250 for d in demands[:5]] + [650], demands))) == ()
+    (note,) = look(list(steps([*demands[:5], 400], demands)))
+    assert note.code == "set_point_missed"
+
+
+def test_one_count_behind_is_behind():
+    drive = Drive(StuckLimits(least=1, travel=1, period=2)).seen(0, 0).seen(1, 1)
+    assert drive.seen(1, 2).is_stuck
+
+
+def test_set_points_too_slow_to_be_judged_are_so_whatever_the_gap_between_replies():
+    watch = StuckWatch.fresh((StuckLimits(8, 28),), NAMES[:1])
+    for cycle in range(100):
+        row = (True, (7 * min(cycle, 50),), (7 * cycle,), (cycle % 2 == 1,))
+        watch, found = watch.update(*row)
+        assert found == ()
+
+
 @pytest.mark.parametrize("gaps", [(1, 2), (2, 1, 1), (2, 3), (1,)])
 def test_a_jam_is_found_also_where_gaps_between_replies_vary(gaps):
     """At 2.5 mm/s, of which 2 are judged."""
