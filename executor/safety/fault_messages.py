@@ -60,7 +60,7 @@ def replies_missing(drive: int, name: str, missing: int, cycles: int) -> Alarm:
     return Alarm(StopReaction.PATH_STOP, "drive_silent", text, drive)
 
 
-def stuck(drive: int, name: str, cycles: int, *, fault: bool, may_disarm: bool = False) -> Alarm:
+def stuck(drive: int, name: str, cycles: int, *, fault: bool, may_disarm: bool) -> Alarm:
     """A drive did not follow its set-points, in the last cycles."""
     text = f"{name} did not move for {_cycles(cycles)} while its set-points advanced"
     if fault:

@@ -64,7 +64,7 @@ def test_other_findings_keep_their_order_and_their_texts() -> None:
 
 
 def missed(drive: int) -> Alarm:
-    return stuck(drive, NAMES[drive - 1], 1, fault=False)
+    return stuck(drive, NAMES[drive - 1], 1, fault=False, may_disarm=False)
 
 
 def test_a_condition_that_persists_or_returns_is_reported_once_with_its_first_values() -> None:
