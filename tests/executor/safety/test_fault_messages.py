@@ -9,10 +9,13 @@ from executor.safety.fault_messages import (
     AlarmHistory,
     StopReaction,
     drive_warning,
+    not_taut,
+    over_tension,
     replies_missing,
     shared_causes,
     slack,
     stuck,
+    went_slack,
 )
 from executor.safety.monitor import Monitor, MonitorLimits, Observation
 from tests.executor import fake_run
@@ -61,6 +64,41 @@ def test_other_findings_keep_their_order_and_their_texts() -> None:
     both = shared_causes([slack[0], *silent(1, 2), slack[1], late], NAMES)
     assert [alarm.code for alarm in both] == ["slack", "drive_silent", "slack", "late"]
     assert shared_causes([*slack, late], NAMES) == (*slack, late)
+
+
+def test_a_torque_that_pays_a_cable_out_names_its_sign() -> None:
+    assert over_tension(3, 103.0, 102.0) == Alarm(
+        StopReaction.PATH_STOP, "over_tension", "cable 3 carries 103.0 N, more than 102.0 N", 3
+    )
+    for positive in (0.0, 0.5):
+        assert over_tension(3, positive, 102.0).text.startswith("cable 3 carries")
+    for negative in (-0.5, -103.0):
+        text = over_tension(3, negative, 102.0).text
+        assert text.startswith(f"the torque of cable 3 pays it out with {-negative:.1f} N, more")
+
+
+def test_what_homing_finds_slack_is_told_in_millimetres_and_ends_on_the_path() -> None:
+    found = not_taut(4, 1.25, 0.0505, 20.0, 0.0014)
+    assert (found.reaction, found.code, found.drive) == (StopReaction.PATH_STOP, "not_taut", 4)
+    assert found.text.startswith(
+        "cable 4 carries 1.2 N after 50.5 mm were wound in; the target is 20.0 N, at which it is"
+        " stretched by 1.4 mm."
+    )
+    # Four and two digits would hide a factor that is off by a thousandth.
+    assert " 6996 mm" in not_taut(4, 1.2, 6.996, 20.0, 0.0).text
+    assert " 9.9e+02 mm" in not_taut(4, 1.2, 0.1, 20.0, 0.9945).text
+    assert " 1e+03 mm" in not_taut(4, 1.2, 0.1, 20.0, 0.9955).text
+    slackened = went_slack(2, 0.4, 2.5, 7)
+    assert slackened == Alarm(
+        StopReaction.PATH_STOP,
+        "went_slack",
+        "cable 2 went slack (0.4 N, less than 2.5) while only cable 7 was moved",
+        2,
+    )
+
+
+def test_ten_events_of_one_note_are_enough() -> None:
+    assert NOTE_EVENTS == 10
 
 
 def missed(drive: int) -> Alarm:
