@@ -52,6 +52,15 @@ def test_drives_that_often_do_not_answer_are_one_cause_too() -> None:
     assert (alarm.code, alarm.reaction) == ("drive_silent", StopReaction.PATH_STOP)
 
 
+def test_only_alarms_of_one_code_and_one_text_are_merged() -> None:
+    """The reaction goes with the code, the number of cycles with the text."""
+    often, in_a_row = replies_missing(1, NAMES[0], 10, 50), silent(2)
+    assert shared_causes([often, *in_a_row], NAMES) == (often, *in_a_row)
+    note = Alarm(StopReaction.NOTE, "reply_lost", f"{NAMES[0]} did not answer", 1)
+    stop = Alarm(StopReaction.QUICK_STOP, "drive_silent", f"{NAMES[1]} did not answer", 2)
+    assert shared_causes([note, stop], NAMES) == (note, stop)
+
+
 def test_some_drives_are_named_and_one_keeps_its_own_text() -> None:
     (alarm,) = shared_causes(silent(2, 5), NAMES)
     assert alarm.text == ("cable 2 (drive 12), cable 5 (drive 15) did not answer for 2 cycles")
