@@ -112,7 +112,9 @@ def test_turning_round_by_a_single_count_ends_the_stretch():
     assert drive.seen(2, 2).replies == ((0, 0), (1, 1), (2, 2))
 
 
-@pytest.mark.parametrize(("ahead", "found"), [(-5000, 6), (0, 6), (100, 6), (250, 7), (350, 8)])
+@pytest.mark.parametrize(
+    ("ahead", "found"), [(-5000, 6), (0, 6), (100, 6), (200, 7), (250, 7), (350, 8)]
+)
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_drive_that_is_behind_is_judged_at_once_and_one_that_is_ahead_once_it_is_passed(
     ahead, found, sign
