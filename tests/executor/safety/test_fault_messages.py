@@ -72,6 +72,8 @@ def test_other_findings_keep_their_order_and_their_texts() -> None:
     slack = [Alarm(StopReaction.PATH_STOP, "slack", f"cable {k} carries 1.0 N", k) for k in (1, 2)]
     both = shared_causes([slack[0], *silent(1, 2), slack[1], late], NAMES)
     assert [alarm.code for alarm in both] == ["slack", "drive_silent", "slack", "late"]
+    apart = shared_causes([silent(1, 2)[0], late, silent(1, 2)[1]], NAMES)
+    assert [alarm.code for alarm in apart] == ["drive_silent", "late"], "where the first one was"
     assert shared_causes([*slack, late], NAMES) == (*slack, late)
 
 

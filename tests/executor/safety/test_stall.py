@@ -152,6 +152,10 @@ def test_a_step_is_missed_only_by_a_drive_that_is_behind():
     assert note.code == "set_point_missed"
 
 
+def test_a_fault_needs_two_cycles_and_one_reply_at_least():
+    assert [StuckLimits(10, 100, period).replies for period in (1, 2, 3, 5)] == [2, 1, 1, 1]
+
+
 def test_one_count_behind_is_behind():
     drive = Drive(StuckLimits(least=1, travel=1, period=2)).seen(0, 0).seen(1, 1)
     assert drive.seen(1, 2).is_stuck
