@@ -163,6 +163,11 @@ class CycleStatus:
     error_frames: int
     warnings: tuple[DriveWarning, ...] = ()
 
+    @property
+    def all_stopped(self) -> bool:
+        """Whether every drive reported in this cycle that it follows no set-points."""
+        return self.stopped and not self.missing.any()
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveSnapshot:

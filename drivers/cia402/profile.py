@@ -286,14 +286,15 @@ def _is_unmonitored(
         unusable, other = not profile.has(*object_key("1006h:00")), "1006h:00"
     else:
         return False
+    if unusable:
+        return True
     try:
         data = read(object_key(other)[0], 0, OBJECTS[other])
-        without_entries = other == "1016h:01" and not any(data or b"")
-        return unusable or data is None or without_entries
     except Refused as error:  # it may have the object
         if "abort_code" not in error.values:
             raise
         return False
+    return data is None or (other == "1016h:01" and not any(data))  # no entries
 
 
 def _how_without_standard(profile: ProfileDocument, index: int, sub: int) -> str:

@@ -216,7 +216,7 @@ class Cycle:
         """From now on the gate allows the range of these set-points, shape (n, m)."""
         self._limits = gate_limits(self._rig, setpoints, self._rig.cycle)
 
-    def approach_cycles(self, first: Array, second: Array) -> int:
+    def _approach_cycles(self, first: Array, second: Array) -> int:
         """Cycles for a `smooth_step` between two sets of drive positions, shape (m,), [counts]."""
         motion, cycle = self._rig.motion, self._rig.cycle
         # The platform may move farther than its cables; so its limits are kept for twice as far.
@@ -228,7 +228,7 @@ class Cycle:
     def approach(self, end: Array) -> Iterator[tuple[int, ...]]:
         """Targets of each cycle of a smooth motion to drive positions, shape (m,), [counts]."""
         begin = np.array(self.targets, dtype=np.float64)
-        steps = self.approach_cycles(begin, end)
+        steps = self._approach_cycles(begin, end)
         for step in range(1, steps + 1):
             share = smooth_step(step / steps)
             yield tuple(int(v) for v in np.rint(begin + share * (end - begin)))

@@ -205,7 +205,7 @@ class Loop:
         left = self._master.leave(self._one_more_at_rest)
         if self.machine.state is not State.SECURING:
             return
-        if left.missing.any() or not left.stopped or (held.holding and not left.holding):
+        if not left.all_stopped or (held.holding and not left.holding):
             self._note_end(left)
             self._fault("not_held", changed_states(self._rig, held, left))
             return

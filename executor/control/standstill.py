@@ -124,7 +124,7 @@ class Standstill(ABC):
     def _require_in_time(self, lateness: float) -> None:
         """Refuses a cycle so late that following drives may have stopped on their own."""
         status = self._master.status
-        following = status is not None and (not status.stopped or status.missing.any())
+        following = status is not None and not status.all_stopped
         if following and not self._master.rule.may_enable(1.0 + lateness):
             raise late_fault(1.0 + lateness)
 
@@ -170,7 +170,7 @@ class Standstill(ABC):
             with suppress(CdprError):
                 status = self._master.exchange(self._group.targets.tolist())
                 self._record(status, 0.0)
-                if status.stopped and not (status.missing.any() or self._group.stopping):
+                if status.all_stopped and not self._group.stopping:
                     break
         self._master.leave_disabled()
 

@@ -23,6 +23,7 @@ from playwright.sync_api import (
     Browser,
     ConsoleMessage,
     FloatRect,
+    Mouse,
     Page,
     TimeoutError,
     expect,
@@ -116,13 +117,26 @@ class Visit:
         if tab.is_visible():
             tab.click()
 
-    def blink(self) -> None:
-        """The data are stale for a moment."""
+    @contextlib.contextmanager
+    def stale(self) -> Iterator[None]:
+        """The data are stale while the block runs, and current afterwards."""
         self.fake.ask(silent=True)
         expect(self.page.locator("#stale")).to_be_visible()
-        self.fake.let_pass(self.page, 2)
+        yield
         self.fake.ask(silent=False)
         expect(self.page.locator("#stale")).to_be_hidden()
+
+    def blink(self) -> None:
+        """The data are stale for a moment."""
+        with self.stale():
+            self.fake.let_pass(self.page, 2)
+
+    def move_to(self, button: str) -> Mouse:
+        """Moves the pointer to a button; returns the mouse."""
+        box = self.page.locator(button).bounding_box()
+        assert box
+        self.page.mouse.move(box["x"] + 9, box["y"] + 9)
+        return self.page.mouse
 
     def send(self, command: str, *buttons: str) -> None:
         """Clicks buttons in turn, until the server has received the command.
@@ -219,9 +233,7 @@ class Visit:
         A busy computer may hold the page up for so long that it ends the press itself, as it must:
         such a press is forgotten, and it is pressed again.
         """
-        box = self.page.locator(f'[data-jog="{name}"]').bounding_box()
-        assert box
-        self.page.mouse.move(box["x"] + 9, box["y"] + 9)
+        self.move_to(f'[data-jog="{name}"]')
         for _ in range(5):
             before = self.fake.ask()["received"]
             self.page.mouse.down()

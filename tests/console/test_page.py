@@ -97,13 +97,10 @@ def test_a_space_on_a_stale_page_stops_where_a_text_field_had_the_focus(desk: Vi
     desk.view("teach")
     field = desk.page.locator("#teach-name")
     field.press_sequentially("left")
-    desk.fake.ask(silent=True)
-    expect(desk.page.locator("#stale")).to_be_visible()
-    expect(field).not_to_be_focused()
-    desk.page.keyboard.press(" ")
-    stops = desk.fake.wait(desk.page, lambda f: bool(f["stops"] >= 1))["stops"]
-    desk.fake.ask(silent=False)
-    expect(desk.page.locator("#stale")).to_be_hidden()
+    with desk.stale():
+        expect(field).not_to_be_focused()
+        desk.page.keyboard.press(" ")
+        stops = desk.fake.wait(desk.page, lambda f: bool(f["stops"] >= 1))["stops"]
     desk.page.keyboard.press(" ")
     desk.fake.wait(desk.page, lambda f: bool(f["stops"] > stops))
     expect(field).to_have_value("left")
@@ -115,11 +112,8 @@ def test_a_text_field_that_was_left_on_a_stale_page_stays_left(desk: Visit) -> N
     desk.view("teach")
     field = desk.page.locator("#teach-name")
     field.press_sequentially("left")
-    desk.fake.ask(silent=True)
-    expect(desk.page.locator("#stale")).to_be_visible()
-    desk.page.locator("#stale-text").click()
-    desk.fake.ask(silent=False)
-    expect(desk.page.locator("#stale")).to_be_hidden()
+    with desk.stale():
+        desk.page.locator("#stale-text").click()
     expect(desk.page.locator("#notice")).to_have_text("Not done: data were not current.")
     desk.page.keyboard.press("Escape")
     desk.fake.wait(desk.page, lambda f: bool(f["stops"] == 1))

@@ -223,17 +223,12 @@ def test_a_press_that_ends_while_data_are_stale_is_not_lost_silently(desk: Visit
     """The browser sends no click then."""
     desk.take_control()
     desk.view("teach")
-    box, mouse = desk.page.locator("#teach").bounding_box(), desk.page.mouse
-    assert box
-    mouse.move(box["x"] + 20, box["y"] + 10)
+    mouse = desk.move_to("#teach")
     mouse.down()
-    desk.fake.ask(silent=True)
-    expect(desk.page.locator("#stale")).to_be_visible()
-    mouse.up()
-    desk.fake.ask(silent=False)
+    with desk.stale():
+        mouse.up()
     notice = desk.page.locator("#notice")
     expect(notice).to_contain_text("Teach this pose: not done. No data from the console’s server")
-    expect(desk.page.locator("#stale")).to_be_hidden()
     desk.fake.let_pass(desk.page)
     assert desk.fake.received("teach") == []
     desk.send("teach", "#teach")
@@ -243,14 +238,9 @@ def test_a_press_that_ends_while_data_are_stale_is_not_lost_silently(desk: Visit
 def test_a_press_that_begins_while_data_are_stale_is_not_lost_silently(desk: Visit) -> None:
     desk.take_control()
     desk.view("teach")
-    box, mouse = desk.page.locator("#teach").bounding_box(), desk.page.mouse
-    assert box
-    mouse.move(box["x"] + 20, box["y"] + 10)
-    desk.fake.ask(silent=True)
-    expect(desk.page.locator("#stale")).to_be_visible()
-    mouse.down()
-    desk.fake.ask(silent=False)
-    expect(desk.page.locator("#stale")).to_be_hidden()
+    mouse = desk.move_to("#teach")
+    with desk.stale():
+        mouse.down()
     mouse.up()
     expect(desk.page.locator("#notice")).to_have_text("Not done: data were not current.")
     desk.fake.let_pass(desk.page)
@@ -266,11 +256,8 @@ def test_enter_held_since_data_were_stale_presses_nothing(desk: Visit) -> None:
     resume, keyboard = desk.page.locator("#resume"), desk.page.keyboard
     expect(resume).not_to_have_attribute("aria-disabled", "true")
     resume.focus()
-    desk.fake.ask(silent=True)
-    expect(desk.page.locator("#stale")).to_be_visible()
-    keyboard.down("Enter")
-    desk.fake.ask(silent=False)
-    expect(desk.page.locator("#stale")).to_be_hidden()
+    with desk.stale():
+        keyboard.down("Enter")
     expect(desk.page.locator("#notice")).to_have_text("Not done: data were not current.")
     expect(resume).to_be_focused()
     keyboard.down("Enter")  # repeats

@@ -146,11 +146,8 @@ def test_a_half_typed_name_is_put_back_where_the_field_was_left_by_stop(desk: Vi
     field = desk.page.get_by_role("textbox", name="Name of pose 1")
     field.press("End")
     desk.page.keyboard.type(" half")
-    desk.fake.ask(silent=True)
-    expect(desk.page.locator("#stale")).to_be_visible()
-    desk.page.keyboard.press("Escape")
-    desk.fake.ask(silent=False)
-    expect(desk.page.locator("#stale")).to_be_hidden()
+    with desk.stale():
+        desk.page.keyboard.press("Escape")
     expect(desk.page.locator("#notice")).to_have_text(
         "“one” was not renamed: data were not current."
     )

@@ -1496,12 +1496,18 @@ def test_a_drive_may_round_the_ramp_of_its_quick_stop(
         set_up(rig, bus)
 
 
-def with_max_current(bus: ScriptedBus) -> None:
-    """6073h as in the standard instead of 6072h: 16 bits, per mille of rated current (6075h)."""
+def with_max_current(rig: Rig, tmp_path: Path, keys: str) -> tuple[Rig, ScriptedBus]:
+    """6073h as in the standard instead of 6072h: 16 bits, per mille of rated current (6075h).
+
+    The profile of the rig states it with these keys.
+    """
+    line = f'torque_limit: {{object: "6073h:00", {keys}}}\nabsent: ["6072h:00"]'
+    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
     for drive in bus.drives.values():
         drive.objects[0x6073, 0] = drive.objects.pop((0x6072, 0))
         drive.values[0x6073, 0] = 1000
         drive.objects[0x6075, 0], drive.values[0x6075, 0] = drive.objects[0x6085, 0], 4200
+    return theirs, bus
 
 
 @pytest.mark.parametrize(
@@ -1509,9 +1515,7 @@ def with_max_current(bus: ScriptedBus) -> None:
 )
 def test_a_current_limit_of_16_bits_is_set(rig: Rig, tmp_path: Path, keys: str, limit: int) -> None:
     """1200 per mille: 100 N at rated torque, 100 N allowed, a fifth in reserve."""
-    line = f'torque_limit: {{object: "6073h:00", bytes: 2{keys}}}\nabsent: ["6072h:00"]'
-    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
-    with_max_current(bus)
+    theirs, bus = with_max_current(rig, tmp_path, f"bytes: 2{keys}")
     assert examined(theirs, bus).good
     set_up(theirs, bus)
     assert {drive.values[0x6073, 0] for drive in bus.drives.values()} == {limit}
@@ -1522,10 +1526,7 @@ def test_a_current_limit_in_a_unit_that_no_object_states_is_set(
     rig: Rig, tmp_path: Path, rated: str, limit: int
 ) -> None:
     """Per mille were written to it unnoticed, as of the drive's peak current of 40 A."""
-    line = f"torque_limit: {{object: '6073h:00', bytes: 2, rated_value: {rated}}}"
-    theirs = with_profile(rig, lab_profile(tmp_path, f'{line}\nabsent: ["6072h:00"]'))
-    bus = eight_of("cia402")
-    with_max_current(bus)
+    theirs, bus = with_max_current(rig, tmp_path, f"bytes: 2, rated_value: {rated}")
     (row,) = (row for row in examined(theirs, bus).rows if row.object.startswith("6073h"))
     assert row.needed == f"{limit}, written at configuration"
     set_up(theirs, bus)
@@ -1536,10 +1537,7 @@ def test_a_current_limit_beyond_its_size_is_refused_before_anything_is_written(
     rig: Rig, tmp_path: Path
 ) -> None:
     """Doctor said ok; the set-up ended after 38 objects of the first drive, without its state."""
-    line = "torque_limit: {object: '6073h:00', bytes: 2, rated_value: 60000}"
-    theirs = with_profile(rig, lab_profile(tmp_path, f'{line}\nabsent: ["6072h:00"]'))
-    bus = eight_of("cia402")
-    with_max_current(bus)
+    theirs, bus = with_max_current(rig, tmp_path, "bytes: 2, rated_value: 60000")
     for does in (examined, set_up):
         with pytest.raises(BadInput, match="6073h:00 current limit cannot hold 72000") as caught:
             does(theirs, bus)
@@ -1550,10 +1548,7 @@ def test_a_current_limit_beyond_its_size_is_refused_before_anything_is_written(
 def test_a_rated_current_too_large_for_the_limit_is_refused_before_anything_is_written(
     rig: Rig, tmp_path: Path
 ) -> None:
-    line = "torque_limit: {object: '6073h:00', bytes: 2, rated: '6075h:00'}"
-    theirs = with_profile(rig, lab_profile(tmp_path, f'{line}\nabsent: ["6072h:00"]'))
-    bus = eight_of("cia402")
-    with_max_current(bus)
+    theirs, bus = with_max_current(rig, tmp_path, 'bytes: 2, rated: "6075h:00"')
     bus.drives[3].values[0x6075, 0] = 60_000
     (row,) = [row for row in examined(theirs, bus).rows if row.verdict == "wrong"]
     assert (row.object[:8], row.found["60000"]) == ("6075h:00", [3])
@@ -1565,9 +1560,7 @@ def test_a_rated_current_too_large_for_the_limit_is_refused_before_anything_is_w
 
 
 def test_a_current_limit_of_another_size_names_the_key_for_it(rig: Rig, tmp_path: Path) -> None:
-    line = 'torque_limit: {object: "6073h:00", rated: "6075h:00"}\nabsent: ["6072h:00"]'
-    theirs, bus = with_profile(rig, lab_profile(tmp_path, line)), eight_of("cia402")
-    with_max_current(bus)
+    theirs, bus = with_max_current(rig, tmp_path, 'rated: "6075h:00"')
     (row,) = [row for row in examined(theirs, bus).rows if row.verdict == "wrong"]
     assert row.object.startswith("6073h:00")
     assert row.change == "profile: `bytes` of torque_limit"
