@@ -75,6 +75,11 @@ def test_other_findings_keep_their_order_and_their_texts() -> None:
     apart = shared_causes([silent(1, 2)[0], late, silent(1, 2)[1]], NAMES)
     assert [alarm.code for alarm in apart] == ["drive_silent", "late"], "where the first one was"
     assert shared_causes([*slack, late], NAMES) == (*slack, late)
+    faults = tuple(
+        Alarm(StopReaction.QUICK_STOP, "drive_fault", f"{NAMES[k - 1]} is in fault", k)
+        for k in (1, 2)
+    )
+    assert shared_causes(faults, NAMES) == faults, "drives rarely fail for one cause"
 
 
 def test_a_torque_that_pays_a_cable_out_names_its_sign() -> None:
