@@ -653,16 +653,19 @@ def test_a_camera_of_opencvs_xml_is_read(rig, tmp_path) -> None:
     assert found.distortion == [0.1, 0.2, 0.0, 0.0, 0.3]
 
 
-def test_a_damaged_opencv_file_ends_in_a_message_not_in_a_dead_program(rig, tmp_path) -> None:
+def test_a_damaged_opencv_file_is_read_or_refused_and_never_ends_the_program(rig, tmp_path) -> None:
     """OpenCV's own reader writes past the end of a matrix with fewer rows than numbers."""
-    whole = FORMATS["opencv"](with_lens(rig, "pinhole", [0.1, 0.2, 0.0, 0.0, 0.3]))
-    file = tmp_path / "camera.yml"
-    for old, new in (("rows: 3", "rows: 99999"), ("dt: d", "dt: 9x"), ("1280", "9" * 400)):
+    own = with_lens(rig, "pinhole", [0.1, 0.2, 0.0, 0.0, 0.3])
+    whole, file = FORMATS["opencv"](own), tmp_path / "camera.yml"
+    for old, new in (("rows: 3", "rows: 99999"), ("dt: d", "dt: 9x")):  # not used
+        assert old in whole
         file.write_text(whole.replace(old, new))
-        try:
-            imported_camera(file, rig.document.cameras[0])
-        except BadInput:
-            continue
+        found = imported_camera(file, rig.document.cameras[0])
+        assert found == own.model_copy(update={"error_mm": None})
+    assert "image_width: 1280\n" in whole
+    file.write_text(whole.replace("1280", "9" * 400))
+    with pytest.raises(BadInput, match="image_width is not a number of pixels"):
+        imported_camera(file, rig.document.cameras[0])
 
 
 def test_ros_has_no_thin_prism(rig) -> None:
