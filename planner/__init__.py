@@ -10,11 +10,9 @@ if TYPE_CHECKING:
     from planner.check import check_path, verify
     from planner.check_report import CheckReport, PlanRejected, VerifiedPlan, Violation
     from planner.planning import plan_from_waypoints, plan_path
-    from planner.rrt.variants import AlgorithmVariant
     from planner.settings import OptimalSettings, PlannerSettings, TurningSettings, Weights
 
 __all__ = [
-    "AlgorithmVariant",
     "CheckReport",
     "OptimalSettings",
     "PlanRejected",
@@ -36,7 +34,6 @@ if not TYPE_CHECKING:
             "planner.check": "check_path verify",
             "planner.check_report": "CheckReport PlanRejected VerifiedPlan Violation",
             "planner.planning": "plan_from_waypoints plan_path",
-            "planner.rrt.variants": "AlgorithmVariant",
             "planner.settings": "OptimalSettings PlannerSettings TurningSettings Weights",
         },
     )
