@@ -22,9 +22,9 @@ from executor.safety.monitor import MonitorLimits
 from executor.safety.stall import STUCK_CYCLES
 from executor.state_machine import State
 from simulation.drives.behaviour import STRICT, DriveBehaviour, behaviour_named
-from simulation.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
 from tests.drivers.drive_bench import make_reply
 from tests.scenarios.faults.bench import EVERY_ID, Bench, Script, SimulatedBench, a_message, once
+from tests.scenarios.faults.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
 from tests.scenarios.faults.samples import emergencies, left_holding
 
 NODES = range(1, 9)
