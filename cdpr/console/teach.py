@@ -46,7 +46,7 @@ def _named_once(poses: list[TaughtPose]) -> list[TaughtPose]:
     names = [pose.name for pose in poses]
     for index, name in enumerate(names):
         if name in names[:index]:
-            raise ValueError(f"pose name {name!r} appears twice")
+            raise ValueError(f"pose name {name!r} appears twice; rename one of them in the file")
     return poses
 
 

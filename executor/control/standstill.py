@@ -216,7 +216,8 @@ def _not_released(what: str) -> Fault:
         what,
         where="release",
         why="a drive did not follow the release sequence; those under torque hold",
-        next_step=AFTER_A_FAULT,
+        next_step=f"{AFTER_A_FAULT}; if none can be released, cut the motor power by the emergency"
+        " stop once the platform is supported",
     )
 
 

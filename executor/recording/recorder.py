@@ -284,33 +284,24 @@ class RecordWriter:
             self._thread = None
 
     def _queue_cycles(self, at: float) -> None:
-        first, mark = self._queued.end, _Mark(len(self._log), at)
-        if mark.end == first:
+        first = self._queued.end
+        if len(self._log) == first:
             return
-        self._queued = mark
-        self._put(partial(self._append, first, mark))
+        self._queued = _Mark(len(self._log), at)
+        self._put(partial(self._append, first))
 
-    def _append(self, first: int, mark: _Mark) -> None:
-        """Appends the cycles up to a mark, and in the same write those that were queued since.
+    def _append(self, first: int) -> None:
+        """Appends the cycles from this one on, those that were queued since included.
 
         Otherwise a disk that takes longer than `EVERY` for any write would fall behind for ever.
         """
         if first != self._written.end:  # written already, or not to be written: leave no gap
             return
         newest = self._queued
-        try:
-            self._append_up_to(newest)
-        except Fault:
-            if newest == mark:
-                raise
-            self._append_up_to(mark)  # a disk without room for all may have room for these
-
-    def _append_up_to(self, mark: _Mark) -> None:
-        first = self._written.end
-        table = self._log.table(first, mark.end)
+        table = self._log.table(first, newest.end)
         header = table.csv_header() if first == 0 else ""
         self._folder.append_cycles(header + table.csv_rows(), fsync=self._own_thread)
-        self._written = mark
+        self._written = newest
 
     def _put(self, write: Callable[[], None]) -> None:
         if self._trouble is not None:

@@ -13,10 +13,10 @@ from model.pose import Array
 
 
 class CsvTable:
-    """Named columns of text and numbers; lines and names that a spreadsheet left empty are ignored.
+    """Named columns of text and numbers, without the lines and columns that are empty.
 
     Attributes:
-        names: Of the columns, in order; several may be empty.
+        names: Of the columns, in order; empty for one that has no name.
     """
 
     def __init__(self, path: Path) -> None:
@@ -24,12 +24,18 @@ class CsvTable:
 
         Raises:
             BadInput: It cannot be read, has other separators than commas, names a column twice, or
-                a line has more or fewer values than there are columns.
+                a line has more or fewer values than there are columns, or several columns of
+                values have no name.
         """
         self._path = path
         file = CsvFile(path)
-        filled = [k for k, row in enumerate(file.rows) if any(text.strip() for text in row)]
-        rows, lines = [file.rows[k] for k in filled], [file.lines[k] for k in filled]
+        widths = [
+            max((k for k, text in enumerate(row, 1) if text.strip()), default=0)
+            for row in file.rows
+        ]
+        used = max(widths, default=0)
+        self._kept = [k for k, width in enumerate(widths) if width]
+        rows, lines = [file.rows[k][:used] for k in self._kept], [file.lines[k] for k in self._kept]
         self.names = tuple(name.strip() for name in rows[0]) if rows else ()
         self._rows, self._lines = rows[1:], lines[1:]
         if not self._rows:
@@ -49,6 +55,12 @@ class CsvTable:
                 )
                 what = f"line {number} has {values} for {columns}"
                 raise self.bad(what, "give every line one value per column")
+        nameless = [
+            not name and any(row[k].strip() for row in self._rows)
+            for k, name in enumerate(self.names)
+        ]
+        if sum(nameless) > 1:  # one may be the numbers of the lines
+            raise self.bad(f"{sum(nameless)} columns of values have no name", "name them")
 
     def require(self, names: Sequence[str]) -> None:
         """Refuses a table that lacks one of these columns.
@@ -87,6 +99,17 @@ class CsvTable:
         self.require([name])
         index = self.names.index(name)
         return [row[index].strip() for row in self._rows]
+
+    def require_no_gap(self) -> None:
+        """Refuses a table with an empty line between others, where a row's place is its number.
+
+        Raises:
+            BadInput: With the first line after a gap.
+        """
+        for before, after, line in zip(self._kept, self._kept[1:], self._lines, strict=False):
+            if after != before + 1:
+                what = f"line {line} follows an empty line"
+                raise self.bad(what, "fill in the empty line, or delete it")
 
     def line(self, row: int) -> int:
         """The line, counted from 1, of a row, counted from 0."""

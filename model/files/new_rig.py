@@ -410,9 +410,11 @@ def read_coordinates(path: Path) -> dict[str, Any]:
         path: Its columns are `CSV_COLUMNS`; others are ignored.
 
     Raises:
-        BadInput: The file cannot be read, a column is missing, or a value is not a number.
+        BadInput: The file cannot be read, a column is missing, a line in between is empty, or a
+            value is not a number.
     """
     table = CsvTable(path)
+    table.require_no_gap()
     points = table.of(CSV_COLUMNS).tolist()
     if not 6 <= len(points) <= CABLES_MOST:
         what = f"{len(points)} cables; a rig has from 6 to {CABLES_MOST}"

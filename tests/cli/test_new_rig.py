@@ -284,6 +284,10 @@ def test_a_table_or_an_option_that_cannot_be_is_refused(tmp_path: Path) -> None:
     few = call("new", tmp_path / "rig.yaml", "--from", cables_csv(tmp_path, 5))
     one_message(few, 2, "5 cables", "from 6 to 24", "one line per cable, 6 or more")
     assert "begin with the line" not in few.err
+    lines = cables_csv(tmp_path).read_text().splitlines()
+    table.write_text("\n".join([*lines[:4], ",,,,,", *lines[5:]]))
+    gap = call("new", tmp_path / "rig.yaml", "--from", table)
+    one_message(gap, 2, "line 6 follows an empty line")  # not cable 5 taken for cable 4
 
 
 def test_a_table_in_metres_or_with_a_cable_twice_is_refused(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import resource
 import threading
 from pathlib import Path
@@ -115,9 +114,9 @@ def test_a_disk_that_hangs_holds_nothing_up_and_is_a_fault_when_it_is_far_behind
 
 
 class Disk:
-    """Keeps the first write until it is let go; ``room`` limits the size of a write, [rows]."""
+    """Keeps the first write until it is let go."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, room: float = math.inf) -> None:
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.begins, self.goes_on = threading.Event(), threading.Event()
         self.writes = 0
         append = RunFolder.append_cycles
@@ -126,8 +125,6 @@ class Disk:
             self.begins.set()
             self.goes_on.wait()
             self.writes += 1
-            if lines.count("\n") > room:
-                raise Fault("No space left on device")
             append(folder, lines, fsync=fsync)
 
         monkeypatch.setattr(RunFolder, "append_cycles", writes)
@@ -156,23 +153,18 @@ def test_cycles_that_waited_for_the_disk_are_written_together(
     assert disk.writes <= 3, "the first cycle, those that waited, and the rest at the end"
 
 
-def test_a_disk_without_room_for_all_that_waited_gets_what_fits(
-    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    disk = Disk(monkeypatch, room=100)
-    writer = disk.record(folder, 401)
-    assert recorded(folder) == list(range(401))
-    writer.take_event(RunEvent(9.0, "stop", "stop requested"))
-
-
 def full_at(size: int, folder: RunFolder) -> RecordWriter:
-    """A writer with a file size limit: part of the last write still fits."""
+    """A writer with a file size limit from the cycle 110 on: part of the last write still fits."""
     log: Any = Log()
+    written = threading.Event()
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
     try:
         with RecordWriter(folder, log, own_thread=True) as writer:
             for number in range(450):
+                if number == 110:
+                    writer.take_file(written.set)
+                    assert written.wait(60.0)
+                    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
                 log.count += 1
                 writer.take_cycles(number * CYCLE)
     finally:

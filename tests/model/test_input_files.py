@@ -94,11 +94,23 @@ def test_columns_and_lines_that_a_spreadsheet_left_empty_are_ignored(tmp_path: P
 
 
 @pytest.mark.parametrize(
+    "text",
+    ["a,b,,\n1,2,,\n3,4\n", "a,b\n1,2,,\n3,4,\n", ",a,,b\n0,1,,2\n1,3,,4\n"],
+    ids=["cut by the spreadsheet", "wider than the header", "lines numbered"],
+)
+def test_empty_cells_beside_the_values_do_not_count(tmp_path: Path, text: str) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    assert CsvTable(tmp_path / "a.csv").of(["a", "b"]).tolist() == [[1.0, 2.0], [3.0, 4.0]]
+
+
+@pytest.mark.parametrize(
     ("text", "what"),
     [
         ("a,b,a\n1,2,3\n", "the column 'a' appears twice"),
         ("a,b\n1,\n", "line 2, b: '' is not a finite number"),
-        ("a,b,\n1,2\n", "line 2 has 2 values for 3 columns"),
+        ("a,b,\n1\n", "line 2 has 1 value for 2 columns"),
+        ("a,b,,\n1,2,3,4\n", "2 columns of values have no name"),
+        ("a,b,,,\n1,2,3,4,\n1,2,,4\n", "2 columns of values have no name"),
         ("a,b\n,\n", "the file holds no values"),
     ],
 )
