@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+import drivers.cameras.frame_reader
 import drivers.cameras.live
-from drivers.cameras.live import FROZEN, LOST_IMAGES, LiveCamera
+from drivers.cameras.frame_reader import FROZEN, LOST_IMAGES
+from drivers.cameras.live import LiveCamera
 from model.errors import BadInput, Fault, HardwareMissing, StoppedByOperator
 from model.rig import Camera
 
@@ -172,8 +174,8 @@ def test_a_camera_without_images_can_be_stopped(
     queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before its first image, and afterwards; it hangs in neither case for the operator."""
-    monkeypatch.setattr(drivers.cameras.live, "ROUND", 1e-3)
-    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)  # it hangs
+    monkeypatch.setattr(drivers.cameras.frame_reader, "ROUND", 1e-3)
+    monkeypatch.setattr(drivers.cameras.frame_reader, "END_TIMEOUT", 0.0)  # it hangs
     hanging = Queue(camera)
     monkeypatch.setattr(drivers.cameras.live, "_opened", {0: queue, 1: hanging}.__getitem__)
     with pytest.raises(StoppedByOperator, match="stopped before"):
@@ -197,7 +199,7 @@ def test_a_camera_that_does_not_open_can_be_stopped(
         return made
 
     monkeypatch.setattr(drivers.cameras.live, "_opened", opened)
-    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)
+    monkeypatch.setattr(drivers.cameras.frame_reader, "END_TIMEOUT", 0.0)
     with pytest.raises(StoppedByOperator):
         LiveCamera("http://[::1]/x", camera, made.clock, stopped=lambda: True)
     (reader,) = [one for one in threading.enumerate() if one.name == "cdpr-pictures"]
