@@ -148,6 +148,8 @@ class VideoFile(FrameSource):
 class LiveCamera(FrameSource):
     """A local or network camera that returns its newest image.
 
+    It opens in about two seconds more than the device: its first images may have waited in queues.
+
     Args:
         source: Index, such as ``0``, device file or address.
         camera: Its description in the rig file.
@@ -193,7 +195,7 @@ class LiveCamera(FrameSource):
             raise
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields images until stopped; those that arrive during processing are skipped.
+        """Yields images until stopped; those that arrive late or during processing are skipped.
 
         Raises:
             Fault: The camera stopped delivering images.
@@ -230,6 +232,11 @@ class LiveCamera(FrameSource):
         kind = Fault if self._seen else HardwareMissing
         what = f"the camera {self._reader.lost or 'delivers no more images'}"
         raise kind(what, where=self.name, why=why, next_step=next_step)
+
+    @property
+    def late(self) -> int:
+        """Number of images skipped after the first, as they may have waited in a queue."""
+        return self._reader.late
 
     def close(self) -> None:
         """Releases the camera."""
