@@ -125,7 +125,7 @@ class VideoFile(FrameSource):
             BadInput: They have another size than the camera, or none can be read.
         """
         capture = _opened_video(self._path, self._camera)
-        number, seconds = 0, -1.0 / self.rate
+        number, seconds, begin = 0, -1.0 / self.rate, 0.0
         try:
             while True:
                 good, picture = capture.read()
@@ -134,7 +134,9 @@ class VideoFile(FrameSource):
                 image = _grey(np.asarray(picture))
                 if number == 0:
                     refuse_wrong_size(image, self._camera, str(self._path))
-                shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
+                    begin = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # not always 0
+                    begin = begin if np.isfinite(begin) else 0.0
+                shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - begin  # the rate may vary
                 is_later = np.isfinite(shown) and shown > seconds
                 seconds = shown if is_later else seconds + 1.0 / self.rate
                 yield Frame(seconds, image, f"image {number}", number)
