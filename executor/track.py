@@ -189,7 +189,7 @@ def track_sources(
             tracking.
         keep: Called with what was measured before an error that ends tracking, unless no image gave
             a pose; the error is then raised.
-        listener: Receives progress, and files that are not used.
+        listener: Receives progress, files that are not used, and remarks on times.
 
     Raises:
         NoPlatformSeen: No image gave a pose.
@@ -418,6 +418,8 @@ def _opened(
         return folder, len(folder)
     if path.is_file():
         video = VideoFile(path, camera)
+        if video.remark:
+            listener.remark(video.remark)
         return video, len(video)
     require_camera_source(source)
     return LiveCamera(source, camera, stopped=stopped), None

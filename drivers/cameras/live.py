@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -63,22 +64,32 @@ class FrameSource:
         """Releases what stays open between images: nothing for files."""
 
 
+#: Begin of a file without times, for which FFmpeg assumes 25 images per second: JPEG images one
+#: after the other, also with HTTP headers, or H.264 or H.265 as the encoder delivers it (start code
+#: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there.
+_NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01[\x00-\x7f]")
+
+
 class VideoFile(FrameSource):
     """The images of a video file.
 
     Args:
         path: The file.
         camera: The camera that took it.
+        rate: Images per second of a file that states no times (default: the camera's), [Hz].
 
     Attributes:
-        rate: Images per second that the file states (default: the camera's), [Hz].
+        rate: Images per second that the file states (default: as given), [Hz].
+        remark: That a rate was assumed, for the operator; empty if the file states its times or
+            `rate` was given.
 
     Raises:
         BadInput: The file is missing, or is not a video, or is an image of several pages; its
-            images have to be rotated by 90°, and the camera has a rolling shutter.
+            images have to be rotated by 90°, and the camera has a rolling shutter; a rate is given
+            for a file that states its times.
     """
 
-    def __init__(self, path: Path, camera: Camera) -> None:
+    def __init__(self, path: Path, camera: Camera, rate: float | None = None) -> None:
         if not path.is_file():
             raise BadInput("no such file", where=str(path), next_step="check the path")
         self._path, self._camera = path, camera
@@ -93,8 +104,7 @@ class VideoFile(FrameSource):
             )
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self._count = max(0, int(count)) if 0 <= count < 1e9 else 0
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        self.rate = rate if np.isfinite(rate) and rate > 0 else camera.rate
+        self._set_rate(capture.get(cv2.CAP_PROP_FPS), rate)
         width, height = _size(capture)
         capture.release()
         if width * height > MOST_PIXELS:
@@ -103,6 +113,25 @@ class VideoFile(FrameSource):
                 where=str(path),
                 why="the file is damaged",
                 next_step="use another file",
+            )
+
+    def _set_rate(self, stated: float, given: float | None) -> None:
+        with self._path.open("rb") as file:
+            self._has_times = _NO_TIMES.match(file.read(64)) is None
+        if self._has_times and given is not None:
+            raise BadInput(
+                "--rate-hz is for a folder of images, or a video without times",
+                where=str(self._path),
+                next_step="leave it out: this video states its rate",
+            )
+        is_stated = self._has_times and np.isfinite(stated) and stated > 0
+        self.rate = stated if is_stated else given or self._camera.rate
+        self.remark = ""
+        if not (self._has_times or given or self._count == 1):
+            self.remark = (
+                f"{self._path.name} states no times: its images are taken as {self.rate:.6g} per"
+                f" second, the rate_hz of camera {self._camera.name}; if that is wrong, state it"
+                f" in a container: ffmpeg -r RATE -i {self._path.name} -c copy video.mp4"
             )
 
     def __len__(self) -> int:
@@ -138,6 +167,7 @@ class VideoFile(FrameSource):
                     begin = begin if np.isfinite(begin) else 0.0
                 shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - begin  # the rate may vary
                 is_later = np.isfinite(shown) and shown > seconds
+                is_later = is_later and self._has_times
                 seconds = shown if is_later else seconds + 1.0 / self.rate
                 yield Frame(seconds, image, f"image {number}", number)
                 number += 1
