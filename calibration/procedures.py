@@ -320,14 +320,14 @@ def measure_readout(
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
     rolling = replace(camera, readout=camera.readout or inf)  # takes no rotated images
-    pictures = open_timed_images(path_of(source), rolling, rate, listener)
+    pictures, known = open_timed_images(path_of(source), rolling, rate, listener)
     to = Destination.of(output)
     to.require_free("readout", camera.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
         observations = observe_tags(images, rig, camera, numbers, pictures.unused)
-    times = {name: float(name.split(" s ")[0]) for name in observations.squares}
+    times = {name: known[name] for name in observations.squares}
     found = fit_readout(rig, camera, observations, times)
     verdict = judge_readout(found, wanted, speed)
     result = readout_result(found, verdict, speed, to.on)

@@ -49,8 +49,8 @@ _STEP = 2e-4
 
 def open_timed_images(
     source: Path, camera: Camera, rate: float | None, listener: Listener
-) -> ImageSet:
-    """All images of a folder or a video, named by their capture time.
+) -> tuple[ImageSet, Mapping[str, float]]:
+    """All images of a folder or a video, and the capture time of each image read so far.
 
     Args:
         source: The folder, or the file.
@@ -59,23 +59,28 @@ def open_timed_images(
         listener: Receives a remark if a video's rate is assumed.
 
     Returns:
-        The images; their names are times in seconds since the first, such as ``0.100000 s a.png``.
+        The images; their names begin with their times, such as ``0.100000 s a.png``. And times
+        by name, since the first image, [s].
 
     Raises:
         BadInput: It is neither, its images are of another size, or a video states its times, but
             a rate is given.
     """
+    times: dict[str, float] = {}
     if is_folder(source):
         folder = ImageFolder(source, camera, rate)
-        return ImageSet(_named_by_time(folder), len(folder), folder.unused)
+        return ImageSet(_named_by_time(folder, times), len(folder), folder.unused), times
     video = VideoFile(source, camera, rate)
     if video.remark:
         listener.remark(video.remark)
-    return ImageSet(_named_by_time(video), len(video))
+    return ImageSet(_named_by_time(video, times), len(video)), times
 
 
-def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
-    return ((f"{frame.time:.6f} s {frame.name}", frame.image) for frame in frames)
+def _named_by_time(frames: Iterable[Frame], times: dict[str, float]) -> Iterator[tuple[str, Image]]:
+    for frame in frames:
+        name = f"{frame.time:.6f} s {frame.name}"
+        times[name] = frame.time
+        yield name, frame.image
 
 
 @dataclass(frozen=True, slots=True, eq=False)

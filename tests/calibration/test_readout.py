@@ -123,6 +123,14 @@ def test_the_rate_of_a_video_without_times_may_be_stated(rig: Rig, tmp_path: Pat
     video.write_bytes(3 * cv2.imencode(".jpg", black)[1].tobytes())
     for rate, last in ((40.0, "0.050000 s image 2"), (None, f"{2.0 / camera.rate:.6f} s image 2")):
         assert texts == []
-        opened = open_timed_images(video, camera, rate, Remarks())
+        opened, _ = open_timed_images(video, camera, rate, Remarks())
         assert [name for name, _ in opened.images][-1] == last
     assert "a.mjpeg states no times" in texts[0]
+
+
+def test_times_do_not_depend_on_the_names_of_images(rig: Rig, film: Path) -> None:
+    """The name states the time for people; the fit needs more digits."""
+    opened, times = open_timed_images(film, rig.cameras[0], 7.0, Listener())
+    names = [name for name, _ in opened.images]
+    assert list(times) == names
+    assert list(times.values()) == [k / 7.0 for k in range(len(names))]
