@@ -69,8 +69,8 @@ class ArrivalSchedule:
     """Judges by their arrivals which images of a camera came on time.
 
     An image is on time if it came at most `TOLERANCE` after it was due: one usual interval after
-    the last one on time was due, and `DRAINING` of it more for each image between them. After such
-    images the reader must also have waited for it, half the usual interval.
+    the last one on time was due, and `DRAINING` of it more for each image skipped between them. If
+    there are any, the reader must also have waited for it, for half the usual interval.
 
     Otherwise it may have waited, until images come evenly and not faster than usual: then none
     waits. So the camera may lose images, or take fewer per second. If it takes more, images are
@@ -124,7 +124,8 @@ class ArrivalSchedule:
         due = self._due + usual * (1.0 + DRAINING * skipped)
         if now - due > TOLERANCE:
             return False
-        # Images that waited come early if the camera now takes more; not by much and for long.
+        # If the camera now takes more, images seem to have caught up too soon, and are ever earlier;
+        # so that none is skipped for ever, those `START` before they are due count.
         if skipped and interval < usual / 2.0 and due - now < START:
             return False
         self._due = min(now, due)

@@ -120,9 +120,9 @@ class VideoFile(FrameSource):
             self._has_times = _NO_TIMES.match(file.read(64)) is None
         if self._has_times and given is not None:
             raise BadInput(
-                "--rate-hz is for a folder of images, or a video without times",
+                "a rate can be given for a folder of images, or a video without times",
                 where=str(self._path),
-                next_step="leave it out: this video states its rate",
+                next_step="leave the rate out: this video states its times",
             )
         is_stated = self._has_times and np.isfinite(stated) and stated > 0
         self.rate = stated if is_stated else given or self._camera.rate
