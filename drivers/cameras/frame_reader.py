@@ -124,8 +124,8 @@ class ArrivalSchedule:
         due = self._due + usual * (1.0 + DRAINING * skipped)
         if now - due > TOLERANCE:
             return False
-        # If the camera now takes more, images seem to have caught up too soon, and are ever earlier;
-        # so that none is skipped for ever, those `START` before they are due count.
+        # If the camera now takes more, images seem to catch up too soon, and are ever
+        # earlier; so that none is skipped for ever, those `START` before they are due count.
         if skipped and interval < usual / 2.0 and due - now < START:
             return False
         self._due = min(now, due)
