@@ -23,10 +23,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from model.files.camera_file import tags_in
 from model.pose import Array, Pose
 from model.rig import Camera, load_rig
 from model.scene import load_scene
-from model.tag_families import tags_in
 from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_images import Condition, HardImage, HardPrinter
 from tracking.camera_model import Image, distort_pixels

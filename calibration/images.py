@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 
 from calibration.targets.boards import Board, DetectedBoard
-from drivers.cameras.files import IMAGE_ENDINGS, ImageFolder, SingleCameraImages
-from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
+from drivers.cameras.files import IMAGE_ENDINGS, SingleCameraImages
+from drivers.cameras.live import LiveCamera, VideoFile, video_size
 from executor.cameras.sources import require_camera_source
 from model.cameras import generic_camera
 from model.errors import BadInput, path_of
@@ -275,37 +275,6 @@ def open_source(source: ImageSource, camera: Camera, wanted: int | None, usual: 
         return _sampled(VideoFile(path, replace(camera, readout=0.0)), most)  # corrects no rows
     require_camera_source(str(source))
     return ImageSet(_live(str(source), camera, most), most, is_live=True)
-
-
-def open_timed_images(source: Path, camera: Camera, rate: float | None) -> ImageSet:
-    """All images of a folder or a video, named by their capture time.
-
-    Args:
-        source: The folder, or the file.
-        camera: The rig's camera that took them.
-        rate: Frame rate of a folder, [Hz]; the camera's when left out.
-
-    Returns:
-        The images; their names are times in seconds since the first, such as ``0.100 s a.png``.
-
-    Raises:
-        BadInput: It is neither, or its images are of another size.
-    """
-    if is_folder(source):
-        folder = ImageFolder(source, camera, rate)
-        return ImageSet(_named_by_time(folder), len(folder), folder.unused)
-    if rate is not None:
-        raise BadInput(
-            "--rate-hz is for a folder of images",
-            where=str(source),
-            next_step="leave it out: a video states its rate",
-        )
-    video = VideoFile(source, camera)
-    return ImageSet(_named_by_time(video), len(video))
-
-
-def _named_by_time(frames: Iterable[Frame]) -> Iterator[tuple[str, Image]]:
-    return ((f"{frame.time:.6f} s {frame.name}", frame.image) for frame in frames)
 
 
 def same_images(sets: Sequence[ImageSet]) -> list[ImageSet]:

@@ -23,7 +23,6 @@ from calibration.images import (
     ImageSource,
     open_images,
     open_source,
-    open_timed_images,
 )
 from calibration.intrinsics.calibrate import (
     CameraCalibration,
@@ -38,6 +37,7 @@ from calibration.intrinsics.readout import (
     ReadoutResult,
     fit_readout,
     judge_readout,
+    open_timed_images,
     readout_page,
     readout_result,
 )
@@ -290,11 +290,11 @@ def measure_readout(
         rig: The robot; its platform moves in the images and carries tags.
         camera: At rest; its matrix and distortion are taken as known.
         source: A video, or a folder of consecutive images.
-        rate: Frame rate of a folder, [Hz]; the camera's when left out.
+        rate: Frame rate of a folder, or of a video without times, [Hz]; the camera's when left out.
         speed: Platform speed for which the error is stated, [m/s]; the rig's when left out.
         wanted: Required error, 95 %, [m].
         output: Folder for the result file and its report; nothing is written when left out.
-        listener: Receives the progress.
+        listener: Receives the progress, and a remark if a video's rate is assumed.
 
     Raises:
         BadInput: There are no tags, or the images do not determine the readout or are rotated by
@@ -308,13 +308,14 @@ def measure_readout(
     require_file_name(camera.name, "cameras")
     require_tags(rig, None)
     rolling = replace(camera, readout=camera.readout or inf)  # takes no rotated images
-    pictures, to = open_timed_images(path_of(source), rolling, rate), Destination.of(output)
+    pictures, known = open_timed_images(path_of(source), rolling, rate, listener)
+    to = Destination.of(output)
     to.require_free("readout", camera.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
         observations = observe_tags(images, rig, camera, numbers, pictures.unused)
-    times = {name: float(name.split(" s ")[0]) for name in observations.squares}
+    times = {name: known[name] for name in observations.squares}
     found = fit_readout(rig, camera, observations, times)
     verdict = judge_readout(found, wanted, speed)
     result = readout_result(found, verdict, speed, to.on)

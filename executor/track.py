@@ -19,6 +19,7 @@ from executor.cameras.sources import (
     cycles_per_image,
     require_camera_source,
     require_one_kind,
+    require_plan_used,
 )
 from executor.kernels import ready_to_measure
 from executor.recording.mcap import write_track_mcap
@@ -160,22 +161,6 @@ def own_drawing(overlay: Path, name: str) -> Path:
     return overlay / name if is_folder(overlay) or not overlay.suffix else own_file(overlay, name)
 
 
-def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
-    """Refuses a plan if no source renders images of it.
-
-    Raises:
-        BadInput: No source is ``synthetic``.
-    """
-    named = list(sources)
-    if plan is not None and SYNTHETIC not in named:
-        raise BadInput(
-            "`plan=` is for the synthetic camera",
-            where="track",
-            why=f"images come from {', '.join(named)}",
-            next_step="name the obstacles with `scene=`, or the source 'synthetic'",
-        )
-
-
 def track_sources(
     rig: Rig,
     sources: Mapping[Camera, str],
@@ -204,7 +189,7 @@ def track_sources(
             tracking.
         keep: Called with what was measured before an error that ends tracking, unless no image gave
             a pose; the error is then raised.
-        listener: Receives progress, and files that are not used.
+        listener: Receives progress, files that are not used, and remarks on times.
 
     Raises:
         NoPlatformSeen: No image gave a pose.
@@ -257,6 +242,12 @@ def track_sources(
             raise
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
+    for camera, (frames, _) in zip(sources, opened, strict=True):
+        if isinstance(frames, LiveCamera) and frames.late:
+            listener.remark(
+                f"camera {camera.name}: {frames.late} images came late and were skipped, as it is"
+                " unknown how long they waited in the network or the computer"
+            )
     return result
 
 
@@ -427,6 +418,8 @@ def _opened(
         return folder, len(folder)
     if path.is_file():
         video = VideoFile(path, camera)
+        if video.remark:
+            listener.remark(video.remark)
         return video, len(video)
     require_camera_source(source)
     return LiveCamera(source, camera, stopped=stopped), None

@@ -9,26 +9,33 @@ Source: Oth, Furgale, Kneip & Siegwart, "Rolling shutter camera calibration", CV
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
+from pathlib import Path
 from typing import ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field
 from scipy.optimize import minimize_scalar
 
+from calibration.images import ImageSet
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
 from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
 from calibration.statistics import Interval, student_factor
 from calibration.tag_map.observations import TagObservations
+from drivers.cameras.files import ImageFolder
+from drivers.cameras.live import Frame, VideoFile
 from model.errors import BadInput
 from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive
+from model.files.reading import is_folder
 from model.files.rig_file import RigDocument
 from model.pose import Array, PlatformMotion, Pose
+from model.progress import Listener
 from model.rig import Camera, Rig
+from tracking.camera_model import Image
 from tracking.measurement import MEMORY
 from tracking.pnp import TagView, refine_pnp, solve_pnp
 from tracking.rolling_shutter import correct_rolling_shutter
@@ -38,6 +45,42 @@ LEAST = 5
 GOOD = 20
 _STEP = 2e-4
 """Step of the readout for finite differences, [s]."""
+
+
+def open_timed_images(
+    source: Path, camera: Camera, rate: float | None, listener: Listener
+) -> tuple[ImageSet, Mapping[str, float]]:
+    """All images of a folder or a video, and the capture time of each image read so far.
+
+    Args:
+        source: The folder, or the file.
+        camera: The rig's camera that took them.
+        rate: Frame rate of a folder, or of a video without times, [Hz]; the camera's when left out.
+        listener: Receives a remark if a video's rate is assumed.
+
+    Returns:
+        The images; their names begin with their times, such as ``0.100000 s a.png``. And times
+        by name, since the first image, [s].
+
+    Raises:
+        BadInput: It is neither, its images are of another size, or a video states its times, but
+            a rate is given.
+    """
+    times: dict[str, float] = {}
+    if is_folder(source):
+        folder = ImageFolder(source, camera, rate)
+        return ImageSet(_named_by_time(folder, times), len(folder), folder.unused), times
+    video = VideoFile(source, camera, rate)
+    if video.remark:
+        listener.remark(video.remark)
+    return ImageSet(_named_by_time(video, times), len(video)), times
+
+
+def _named_by_time(frames: Iterable[Frame], times: dict[str, float]) -> Iterator[tuple[str, Image]]:
+    for frame in frames:
+        name = f"{frame.time:.6f} s {frame.name}"
+        times[name] = frame.time
+        yield name, frame.image
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from drivers.cameras.live import silent_opencv
 from model.errors import BadInput, require_fields
+from model.files.camera_file import FAMILIES
 from model.files.csv_table import CsvTable
 from model.pose import Array, read_only
 from model.rig import Camera
-from model.tag_families import FAMILIES
 from tracking.camera_model import Image
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import UNIT_SQUARE, diagnose_tags, printed_share

@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from calibration.targets.boards import LEAST_POINTS, DetectedBoard, require_board
 from model.cameras import generic_camera
 from model.errors import require_fields
+from model.files.camera_file import FAMILIES, tags_in
 from model.pose import Array
 from model.rig import Camera
-from model.tag_families import FAMILIES, tags_in
 from tracking.camera_model import Image, distort_pixels, has_rays, undistort_pixels
 from tracking.detection.detector import TagDetector
 from tracking.detection.diagnostics import diagnose_tags, row_numbering, tag_offsets

@@ -9,9 +9,9 @@ from cdpr.cli.arguments import argument, flag, option, required
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, err, present, show_line
-from executor.cameras.sources import parse_camera_sources
+from executor.cameras.sources import parse_camera_sources, require_plan_used
 from executor.supervision import LocalRequests
-from executor.track import TrackResult, own_drawing, own_file, require_plan_used, track_sources
+from executor.track import TrackResult, own_drawing, own_file, track_sources
 from model.files.output import refuse_overwriting, require_new_file
 from model.plan import load_plan, require_same_rig
 from model.rig import Camera, Rig, load_rig, rig_from_document

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import pairwise
+from itertools import chain, count, pairwise
 from pathlib import Path
 from types import TracebackType
 
@@ -418,11 +418,12 @@ class ImageOutput:
             raise _unwritable(Path(error.where), error.why) from None
 
     def _file_name(self, name: str) -> str:
-        """File name of an image: ``a.png``, or ``a.jpg.png`` if ``a.png`` is taken."""
+        """File name of an image: ``a.png``, or if taken ``a.jpg.png``, or ``a-2.png``."""
         whole = "".join(sign if sign.isalnum() or sign in "-_." else "_" for sign in name)
-        short = Path(whole).stem + ".png"
-        owner = self._names.setdefault(short, name)
-        return short if owner == name else whole + ".png"
+        stem = Path(whole).stem
+        numbered = (f"{stem}-{k}.png" for k in count(2))
+        free = chain((f"{stem}.png", f"{whole}.png"), numbered)
+        return next(file for file in free if self._names.setdefault(file, name) == name)
 
     def _to_video(self, picture: NDArray[np.uint8]) -> None:
         if self._video is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import threading
+import re
 import time
 import weakref
 from collections.abc import Callable, Iterator
@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cameras.frame_reader import NOT_OPENED, FrameReader
 from model.errors import (
     BadInput,
     Fault,
@@ -26,129 +27,6 @@ from model.errors import (
 )
 from model.files.reading import MOST_PIXELS, require_one_page
 from model.rig import Camera
-
-# The newest image of a camera that delivers them faster than they are used.
-#
-# Images wait in queues of the network, the driver and the decoder. A reader slower than the camera
-# would measure ever older images, so a thread reads all of them and keeps the last.
-
-
-#: Consecutive failed reads after which a camera counts as lost.
-LOST_IMAGES = 5
-#: The same after copies of one image for this long, [s]. A video codec may repeat an image of a
-#: platform at rest up to its next complete one, for 10 s and more.
-FROZEN = 60.0
-#: Longest wait for the reading thread when closing, and interval of checks for a stop, [s].
-END_TIMEOUT, ROUND = 2.0, 0.1
-NOT_OPENED = "cannot be opened"
-"""Why a camera delivers no images, as a predicate."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Arrived:
-    """An image as delivered.
-
-    Attributes:
-        number: Number of the camera's image from 0, including skipped ones.
-        time: Time of arrival on the reader's clock, [s].
-        picture: As the camera delivered it.
-    """
-
-    number: int
-    time: float
-    picture: NDArray[np.generic]
-
-
-class FrameReader:
-    """Opens a camera and reads all its images in a thread.
-
-    A copy of the image before is not a new one: noise makes images of a camera differ, but a
-    decoder or driver that hangs may repeat its last one.
-
-    Attributes:
-        lost: Why the camera delivers no more, as a predicate of it.
-    """
-
-    def __init__(self, opened: Callable[[], cv2.VideoCapture], clock: Callable[[], float]) -> None:
-        """Starts the thread.
-
-        Args:
-            opened: Opens the camera, called by the thread: it may take half a minute.
-            clock: Monotonic time, [s].
-        """
-        self._opened, self._clock = opened, clock
-        self._changed = threading.Condition()
-        self._newest: Arrived | None = None
-        self.lost = ""
-        self._ended = self._is_closing = False
-        self._thread = threading.Thread(target=self._read, name="cdpr-pictures", daemon=True)
-        self._thread.start()
-
-    def newest(self, stopped: Callable[[], bool]) -> Arrived | None:
-        """Waits for the newest image not returned before.
-
-        Args:
-            stopped: Called repeatedly; True ends the wait.
-
-        Returns:
-            None once the camera delivers no more, or the wait was ended.
-        """
-        with self._changed:
-            while not self._changed.wait_for(lambda: self._newest or self._ended, ROUND):
-                if stopped():
-                    break
-            newest, self._newest = self._newest, None
-            return newest
-
-    def close(self) -> None:
-        """Stops the thread; a hanging camera keeps it until this process ends."""
-        self._is_closing = True
-        if threading.current_thread() is not self._thread:
-            self._thread.join(END_TIMEOUT)
-
-    def _read(self) -> None:
-        try:
-            capture = self._opened()
-            try:
-                self._read_all(capture)
-            finally:
-                capture.release()
-        finally:
-            with self._changed:
-                self._ended = True
-                self._changed.notify_all()
-
-    def _read_all(self, capture: cv2.VideoCapture) -> None:
-        """Puts each image of a camera until that is lost, or this closed."""
-        number = failed = 0
-        last: Arrived | None = None
-        self.lost = "" if capture.isOpened() else NOT_OPENED
-        while not (self.lost or self._is_closing):
-            good, picture = capture.read()
-            now = self._clock()
-            failed = 0 if good else failed + 1
-            if failed == LOST_IMAGES:
-                self.lost = f"failed to deliver an image {LOST_IMAGES} times in a row"
-            if not good:
-                continue
-            arrived = Arrived(number, now, np.asarray(picture))
-            number += 1
-            if last is None or not _is_copy(arrived.picture, last.picture):
-                last = arrived
-                self._put(arrived)
-            elif now - last.time > FROZEN:
-                self.lost = f"delivered the same image for {FROZEN:g} s"
-
-    def _put(self, arrived: Arrived) -> None:
-        with self._changed:
-            self._newest = arrived
-            self._changed.notify_all()
-
-
-def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
-    """Whether two images are equal; a few of their rows suffice for most that are not."""
-    return np.array_equal(picture[::64], last[::64]) and np.array_equal(picture, last)
-
 
 Image = NDArray[np.uint8]
 LAST_CAMERA = 255
@@ -186,22 +64,32 @@ class FrameSource:
         """Releases what stays open between images: nothing for files."""
 
 
+#: Begin of a file without times, for which FFmpeg assumes 25 images per second: JPEG images one
+#: after the other, also with HTTP headers, or H.264 or H.265 as the encoder delivers it (start code
+#: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there.
+_NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01[\x00-\x7f]")
+
+
 class VideoFile(FrameSource):
     """The images of a video file.
 
     Args:
         path: The file.
         camera: The camera that took it.
+        rate: Images per second of a file that states no times (default: the camera's), [Hz].
 
     Attributes:
-        rate: Images per second that the file states (default: the camera's), [Hz].
+        rate: Images per second that the file states (default: as given), [Hz].
+        remark: That a rate was assumed, for the operator; empty if the file states its times or
+            `rate` was given.
 
     Raises:
         BadInput: The file is missing, or is not a video, or is an image of several pages; its
-            images have to be rotated by 90°, and the camera has a rolling shutter.
+            images have to be rotated by 90°, and the camera has a rolling shutter; a rate is given
+            for a file that states its times.
     """
 
-    def __init__(self, path: Path, camera: Camera) -> None:
+    def __init__(self, path: Path, camera: Camera, rate: float | None = None) -> None:
         if not path.is_file():
             raise BadInput("no such file", where=str(path), next_step="check the path")
         self._path, self._camera = path, camera
@@ -216,8 +104,7 @@ class VideoFile(FrameSource):
             )
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self._count = max(0, int(count)) if 0 <= count < 1e9 else 0
-        rate = capture.get(cv2.CAP_PROP_FPS)
-        self.rate = rate if np.isfinite(rate) and rate > 0 else camera.rate
+        self._set_rate(capture.get(cv2.CAP_PROP_FPS), rate)
         width, height = _size(capture)
         capture.release()
         if width * height > MOST_PIXELS:
@@ -226,6 +113,25 @@ class VideoFile(FrameSource):
                 where=str(path),
                 why="the file is damaged",
                 next_step="use another file",
+            )
+
+    def _set_rate(self, stated: float, given: float | None) -> None:
+        with self._path.open("rb") as file:
+            self._has_times = _NO_TIMES.match(file.read(64)) is None
+        if self._has_times and given is not None:
+            raise BadInput(
+                "a rate can be given for a folder of images, or a video without times",
+                where=str(self._path),
+                next_step="leave the rate out: this video states its times",
+            )
+        is_stated = self._has_times and np.isfinite(stated) and stated > 0
+        self.rate = stated if is_stated else given or self._camera.rate
+        self.remark = ""
+        if not (self._has_times or given or self._count == 1):
+            self.remark = (
+                f"{self._path.name} states no times: its images are taken as {self.rate:.6g} per"
+                f" second, the rate_hz of camera {self._camera.name}; if that is wrong, state it"
+                f" in a container: ffmpeg -r RATE -i {self._path.name} -c copy video.mp4"
             )
 
     def __len__(self) -> int:
@@ -248,7 +154,7 @@ class VideoFile(FrameSource):
             BadInput: They have another size than the camera, or none can be read.
         """
         capture = _opened_video(self._path, self._camera)
-        number, seconds = 0, -1.0 / self.rate
+        number, seconds, begin = 0, -1.0 / self.rate, 0.0
         try:
             while True:
                 good, picture = capture.read()
@@ -257,8 +163,11 @@ class VideoFile(FrameSource):
                 image = _grey(np.asarray(picture))
                 if number == 0:
                     refuse_wrong_size(image, self._camera, str(self._path))
-                shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
+                    begin = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # not always 0
+                    begin = begin if np.isfinite(begin) else 0.0
+                shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - begin  # the rate may vary
                 is_later = np.isfinite(shown) and shown > seconds
+                is_later = is_later and self._has_times
                 seconds = shown if is_later else seconds + 1.0 / self.rate
                 yield Frame(seconds, image, f"image {number}", number)
                 number += 1
@@ -270,6 +179,8 @@ class VideoFile(FrameSource):
 
 class LiveCamera(FrameSource):
     """A local or network camera that returns its newest image.
+
+    It opens in about two seconds more than the device: its first images may have waited in queues.
 
     Args:
         source: Index, such as ``0``, device file or address.
@@ -316,7 +227,7 @@ class LiveCamera(FrameSource):
             raise
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields images until stopped; those that arrive during processing are skipped.
+        """Yields images until stopped; those that arrive late or during processing are skipped.
 
         Raises:
             Fault: The camera stopped delivering images.
@@ -353,6 +264,11 @@ class LiveCamera(FrameSource):
         kind = Fault if self._seen else HardwareMissing
         what = f"the camera {self._reader.lost or 'delivers no more images'}"
         raise kind(what, where=self.name, why=why, next_step=next_step)
+
+    @property
+    def late(self) -> int:
+        """Number of images skipped after the first, as they may have waited in a queue."""
+        return self._reader.late
 
     def close(self) -> None:
         """Releases the camera."""

@@ -305,6 +305,22 @@ def cycles_per_image(rate: float, cycle: float) -> int:
     return max(1, math.ceil(1.0 / (rate * cycle) - 1e-9))
 
 
+def require_plan_used(sources: Iterable[str], plan: object | None) -> None:
+    """Refuses a plan if no source renders images of it.
+
+    Raises:
+        BadInput: No source is ``synthetic``.
+    """
+    named = list(sources)
+    if plan is not None and SYNTHETIC not in named:
+        raise BadInput(
+            "`plan=` is for the synthetic camera",
+            where="track",
+            why=f"images come from {', '.join(named)}",
+            next_step="name the obstacles with `scene=`, or the source 'synthetic'",
+        )
+
+
 def require_one_kind(sources: Mapping[str, str]) -> None:
     """Refuses to pair images of folders, videos, live and synthetic cameras with each other.
 

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model.files.camera_file import drawn_upside_down
 from model.pose import Array, Pose
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
@@ -29,7 +30,6 @@ from model.shapes import (
     convex_hull,
     shape_points,
 )
-from model.tag_families import drawn_upside_down
 from tracking.camera_model import pixels_of
 from tracking.detection.tags import dictionary, modules_across
 

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.intrinsics.readout import readout_page
+from calibration.intrinsics.readout import open_timed_images, readout_page
 from calibration.procedures import measure_readout
 from calibration.result_files import load_result
 from model.errors import BadInput
 from model.pose import PlatformMotion, Pose
+from model.progress import Listener
 from model.rig import Rig, load_rig
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
@@ -101,8 +102,38 @@ def test_few_images_and_a_rate_for_a_video_are_refused(rig: Rig, film: Path, tmp
     for name in ("000.png", "001.png", "002.png"):
         (tmp_path / name).write_bytes((film / name).read_bytes())
     one_message(call("calibrate", "readout", RIG, tmp_path), 2, "5 are required")
-    video = tmp_path / "a.avi"
-    video.write_bytes(b"x")
+    video, size = tmp_path / "a.avi", (rig.cameras[0].width, rig.cameras[0].height)
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, size, False)
+    writer.write(np.zeros(size[::-1], np.uint8))
+    writer.release()
     one_message(
-        call("calibrate", "readout", RIG, video, "--rate-hz", "3"), 2, "--rate-hz is for a folder"
+        call("calibrate", "readout", RIG, video, "--rate-hz", "3"),
+        2,
+        "a rate can be given for a folder",
     )
+
+
+def test_the_rate_of_a_video_without_times_may_be_stated(rig: Rig, tmp_path: Path) -> None:
+    """Without, it is the camera's, which is remarked on."""
+
+    class Remarks(Listener):
+        def remark(self, text: str) -> None:
+            texts.append(text)
+
+    texts: list[str] = []
+    camera, video = rig.cameras[0], tmp_path / "a.mjpeg"
+    black = np.zeros((camera.height, camera.width), np.uint8)
+    video.write_bytes(3 * cv2.imencode(".jpg", black)[1].tobytes())
+    for rate, last in ((40.0, "0.050000 s image 2"), (None, f"{2.0 / camera.rate:.6f} s image 2")):
+        assert texts == []
+        opened, _ = open_timed_images(video, camera, rate, Remarks())
+        assert [name for name, _ in opened.images][-1] == last
+    assert "a.mjpeg states no times" in texts[0]
+
+
+def test_times_do_not_depend_on_the_names_of_images(rig: Rig, film: Path) -> None:
+    """The name states the time for people; the fit needs more digits."""
+    opened, times = open_timed_images(film, rig.cameras[0], 7.0, Listener())
+    names = [name for name, _ in opened.images]
+    assert list(times) == names
+    assert list(times.values()) == [k / 7.0 for k in range(len(names))]

@@ -80,7 +80,7 @@ OPTION = re.compile(r"(?<![\w-])(?<!var\()--[a-z]")
 #: Modules of the library with options that have no Python form, and why.
 ONLY_TYPED = {
     "calibration/extrinsics/camera_pairs.py": "--board",
-    "calibration/images.py": "--live and --rate-hz",
+    "calibration/images.py": "--live",
     "calibration/intrinsics/exchange.py": "calibrate export and import",
     "calibration/targets/printing.py": "calibrate print",
     "drivers/plausibility.py": "part of the command `cdpr home`",

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from model.errors import BadInput
+from model.files.camera_file import FAMILIES, opencv_dictionary, tags_in
 from model.pose import Pose
 from model.rig import Camera, Rig, rig_from_document
 from model.scene import Scene
-from model.tag_families import FAMILIES, opencv_dictionary, tags_in
 from simulation.camera.camera import SyntheticCamera
 from tests.tracking.hard_images import Condition, HardPrinter
 from tests.tracking.tag_images import FAMILY

@@ -104,6 +104,18 @@ def test_a_full_disk_leaves_no_empty_picture(
     assert [path.name for path in (tmp_path / "drawn").iterdir()] == ["a.png"]
 
 
+def test_no_drawn_picture_replaces_another(tmp_path: Path) -> None:
+    """Names that differ in signs or in the suffix only have a file each."""
+    names = ["a b.jpg", "a+b.jpg", "a_b.jpg", "a_b.png", "a.png", "a.jpg", "a.jpg.png"]
+    with ImageOutput(tmp_path / "drawn", 10.0) as out:
+        for k, name in enumerate(names):
+            out.write(np.full((4, 6, 3), k, np.uint8), name)
+    written = ["a_b.png", "a_b.jpg.png", "a_b-2.png", "a_b.png.png"]
+    written += ["a.png", "a.jpg.png", "a.jpg.png.png"]
+    drawn = [cv2.imread(str(tmp_path / "drawn" / name)) for name in written]
+    assert [int(picture[0, 0, 0]) for picture in drawn if picture is not None] == [*range(7)]
+
+
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi"])
 def test_a_video_has_its_name_once_it_is_whole(tmp_path: Path, name: str) -> None:
     with ImageOutput(tmp_path / name, 10.0) as out:

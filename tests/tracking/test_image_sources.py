@@ -310,6 +310,9 @@ class Capture:
     def release(self) -> None:
         pass
 
+    def isOpened(self) -> bool:  # noqa: N802  # as OpenCV has it
+        return True
+
 
 @pytest.mark.parametrize(
     ("stated", "expected"),
@@ -318,6 +321,7 @@ class Capture:
         ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2]),
         ([float("nan")] * 3, [0.0, 0.1, 0.2]),
         ([0.0, 500.0, 100.0, 900.0], [0.0, 0.5, 0.6, 0.9]),
+        ([66.7, 100.0, 133.3], [0.0, 0.0333, 0.0666]),  # H.264 with B-frames in AVI
     ],
 )
 def test_a_video_may_change_its_rate(
@@ -337,6 +341,53 @@ def test_a_video_may_change_its_rate(
     capture = Capture(stated, (camera.height, camera.width))
     monkeypatch.setattr("drivers.cameras.live._opened", lambda _path: capture)
     assert [frame.time for frame in video] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("over_http", [False, True])
+def test_a_stream_without_times_has_the_camera_s_rate(
+    tmp_path: Path, camera: Camera, over_http: bool
+) -> None:
+    """FFmpeg would assume 25 images per second."""
+    path = tmp_path / "a.mjpeg"
+    image = np.zeros((camera.height, camera.width), np.uint8)
+    jpegs = [cv2.imencode(".jpg", image + k)[1].tobytes() for k in range(5)]
+    if over_http:
+        kind = b"--b\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n"
+        jpegs = [kind % len(jpeg) + jpeg + b"\r\n" for jpeg in jpegs]
+    path.write_bytes(b"".join(jpegs))
+    video = VideoFile(path, replace(camera, rate=10.0))
+    assert [frame.time for frame in video] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert "a.mjpeg states no times: its images are taken as 10 per second" in video.remark
+    given = VideoFile(path, camera, rate=40.0)
+    assert [frame.time for frame in given] == pytest.approx([0.0, 0.025, 0.05, 0.075, 0.1])
+    assert given.remark == ""
+
+
+@pytest.mark.parametrize(
+    ("begin", "has_times"),
+    [
+        (b"\0\0\0\1\x67\x64\0", False),  # H.264
+        (b"\0\0\0\1\x40\x01\x0c", False),  # H.265
+        (b"\0\0\1\xba\x44\0", True),  # MPEG program stream
+        (b"\0\0\1\xb3\x14\0", True),  # MPEG-2
+        (b"\0\0\0\x20ftypisom", True),  # MP4
+        (b"RIFF\0\0\0\0AVI LIST", True),
+        (b"\x1a\x45\xdf\xa3\x01\0", True),  # Matroska
+        (b"\x47\x40\x11\x10\0", True),  # MPEG transport stream
+    ],
+)
+def test_streams_without_times_are_known_by_their_first_bytes(
+    tmp_path: Path,
+    camera: Camera,
+    monkeypatch: pytest.MonkeyPatch,
+    begin: bytes,
+    has_times: bool,
+) -> None:
+    path = tmp_path / "video"
+    path.write_bytes(begin)
+    capture = Capture([0.0, 33.0], (camera.height, camera.width))
+    monkeypatch.setattr("drivers.cameras.live._opened", lambda _path: capture)
+    assert (VideoFile(path, replace(camera, rate=7.0)).rate == 7.0) is not has_times
 
 
 def test_a_file_that_is_no_video_is_refused(tmp_path: Path, camera: Camera) -> None:

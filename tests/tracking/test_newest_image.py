@@ -10,17 +10,23 @@ from typing import Any
 import numpy as np
 import pytest
 
+import drivers.cameras.frame_reader
 import drivers.cameras.live
-from drivers.cameras.live import FROZEN, LOST_IMAGES, LiveCamera
+from drivers.cameras.frame_reader import FROZEN, LOST_IMAGES
+from drivers.cameras.live import LiveCamera
 from model.errors import BadInput, Fault, HardwareMissing, StoppedByOperator
 from model.rig import Camera
+
+#: Images until the first on time, which a camera returns as it opens: it comes at 2 s.
+OPENING = 201
 
 
 class Queue:
     """Queue of camera images.
 
-    An image's brightness is its number, or with ``repeats`` that of the first of so many equal
-    ones. Reading one takes no time; when none waits, reading waits, as with a camera, for the next.
+    An image's brightness is its number (modulo 256), or with ``repeats`` that of the first of so
+    many equal ones. Reading one takes no time; when none waits, reading waits, as with a camera,
+    for the next.
     """
 
     repeats = 1
@@ -65,7 +71,7 @@ class Queue:
                 return False, None
             self._taken += 1
             number = self._taken - 1
-            return True, np.full(self._shape, number - number % self.repeats, np.uint8)
+            return True, np.full(self._shape, (number - number % self.repeats) % 256, np.uint8)
 
     def release(self) -> None:
         self.released = True
@@ -86,33 +92,33 @@ def queue(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> Iterator[Queue]:
 def test_the_newest_picture_is_answered_with_the_time_at_which_it_came(
     queue: Queue, camera: Camera
 ) -> None:
-    queue.take(1)
+    queue.take(OPENING)
     with LiveCamera("0", camera, queue.clock) as live:
-        for number in (30, 60, 90):  # it takes thirty while one is asked for
+        for number in (230, 260, 290):  # it takes thirty while one is asked for
             queue.take(30)
             queue.wait_until_read()
             frame = live.read()
-            assert (int(frame.image[0, 0]), frame.name) == (number, f"image {number}")
+            assert (int(frame.image[0, 0]), frame.name) == (number % 256, f"image {number}")
             assert frame.time == pytest.approx(number / 100.0)
         queue.unplug()
     assert queue.released
 
 
 def test_a_picture_was_exposed_its_latency_before_it_came(queue: Queue, camera: Camera) -> None:
-    queue.take(1)
+    queue.take(OPENING)
     with LiveCamera("0", replace(camera, latency=0.08), queue.clock) as live:
         queue.take(5)
         queue.wait_until_read()
-        assert live.read().time == pytest.approx(0.05 - 0.08)
+        assert live.read().time == pytest.approx(2.05 - 0.08)
         queue.unplug()
 
 
 def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
-    queue.take(1)
+    queue.take(OPENING)
     with LiveCamera("0", camera, queue.clock) as live:
         later = threading.Timer(0.0, queue.take, [1])
         later.start()
-        assert live.read().name == "image 1"
+        assert live.read().name == "image 201"
         later.join()
         queue.unplug()
 
@@ -120,22 +126,53 @@ def test_no_picture_is_answered_twice(queue: Queue, camera: Camera) -> None:
 def test_a_copy_of_the_last_picture_is_not_a_new_one(queue: Queue, camera: Camera) -> None:
     """A hanging decoder repeats its last image; its platform would be measured as at rest."""
     queue.repeats = 4
-    queue.take(1)
+    queue.take(OPENING)
     with LiveCamera("0", camera, queue.clock) as live:
         queue.take(6)
         queue.wait_until_read()
         frame = live.read()
-        assert (int(frame.image[0, 0]), frame.name) == (4, "image 4")
-        assert frame.time == pytest.approx(0.04)
+        assert (int(frame.image[0, 0]), frame.name) == (204, "image 204")
+        assert frame.time == pytest.approx(2.04)
         queue.take(2)
         queue.wait_until_read()
-        assert live.read().name == "image 8"
+        assert live.read().name == "image 208"
         queue.unplug()
+
+
+def test_images_that_waited_are_skipped(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a pause of 1 s at 100 images/s, a hundred come at once: nobody knows their times."""
+    read_at = [k / 100.0 for k in range(300)]  # taken at the same times
+    read_at += [4.0 + 1e-3 * k for k in range(100)]
+    read_at += [k / 100.0 for k in range(411, 500)]
+    monkeypatch.setattr(queue, "clock", lambda: read_at[max(0, queue._taken - 1)])
+    queue.take(OPENING)
+    with LiveCamera("0", camera, queue.clock) as live:
+        queue.take(400 - OPENING)
+        queue.wait_until_read()
+        frame = live.read()
+        assert (frame.name, frame.time) == ("image 299", pytest.approx(2.99))
+        queue.take(60)
+        queue.wait_until_read()
+        frame = live.read()
+        assert (frame.name, frame.time) == ("image 459", pytest.approx(4.70))
+        queue.unplug()
+
+
+def test_a_camera_without_an_image_on_time_is_lost(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(queue, "clock", lambda: 0.2 * queue._taken + 0.15 * (queue._taken % 2))
+    queue.take(round(5 * FROZEN) + 2)
+    with pytest.raises(HardwareMissing, match=f"delivered no image on time for {FROZEN:g} s"):
+        LiveCamera("0", camera, queue.clock)
+    assert queue.released
 
 
 def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera: Camera) -> None:
     queue.repeats = 100_000
-    queue.take(1)
+    queue.take(OPENING)
     with LiveCamera("7", camera, queue.clock) as live:
         queue.take(round(100 * FROZEN) + 2)
         with pytest.raises(Fault, match=f"the same image for {FROZEN:g} s") as caught:
@@ -145,7 +182,7 @@ def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera
 
 
 def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: Camera) -> None:
-    queue.take(1)
+    queue.take(OPENING)
     with LiveCamera("7", camera, queue.clock) as live:
         queue.unplug()
         with pytest.raises(Fault, match=f"{LOST_IMAGES} times in a row") as caught:
@@ -162,7 +199,7 @@ def test_a_camera_without_images_or_of_another_size_is_released(
     assert queue.released
     monkeypatch.setattr(queue, "released", False)
     monkeypatch.setattr(queue, "_shape", (4, 5, 3))
-    queue.take(1)
+    queue.take(OPENING)
     with pytest.raises(BadInput, match="5 x 4 px"):
         LiveCamera("0", camera, queue.clock)
     assert queue.released
@@ -172,14 +209,14 @@ def test_a_camera_without_images_can_be_stopped(
     queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before its first image, and afterwards; it hangs in neither case for the operator."""
-    monkeypatch.setattr(drivers.cameras.live, "ROUND", 1e-3)
-    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)  # it hangs
+    monkeypatch.setattr(drivers.cameras.frame_reader, "ROUND", 1e-3)
+    monkeypatch.setattr(drivers.cameras.frame_reader, "END_TIMEOUT", 0.0)  # it hangs
     hanging = Queue(camera)
     monkeypatch.setattr(drivers.cameras.live, "_opened", {0: queue, 1: hanging}.__getitem__)
     with pytest.raises(StoppedByOperator, match="stopped before"):
         LiveCamera("1", camera, hanging.clock, stopped=lambda: True)
     hanging.unplug()
-    queue.take(1)
+    queue.take(OPENING)
     request = threading.Event()
     with LiveCamera("0", camera, queue.clock, stopped=request.is_set) as live:
         request.set()
@@ -197,7 +234,7 @@ def test_a_camera_that_does_not_open_can_be_stopped(
         return made
 
     monkeypatch.setattr(drivers.cameras.live, "_opened", opened)
-    monkeypatch.setattr(drivers.cameras.live, "END_TIMEOUT", 0.0)
+    monkeypatch.setattr(drivers.cameras.frame_reader, "END_TIMEOUT", 0.0)
     with pytest.raises(StoppedByOperator):
         LiveCamera("http://[::1]/x", camera, made.clock, stopped=lambda: True)
     (reader,) = [one for one in threading.enumerate() if one.name == "cdpr-pictures"]
@@ -207,10 +244,10 @@ def test_a_camera_that_does_not_open_can_be_stopped(
 
 
 def test_no_thread_is_left_without_a_close(queue: Queue, camera: Camera) -> None:
-    queue.take(1)
+    queue.take(OPENING)
     live = LiveCamera("0", camera, queue.clock)
     queue.take(1)
-    assert int(next(iter(live)).image[0, 0]) <= 1
+    assert next(iter(live)).name == "image 201"
     queue.unplug()
     del live
     assert queue.released

@@ -128,6 +128,14 @@ def test_a_source_that_is_none_and_a_camera_without_a_path_are_refused(rig: Rig)
         track_sources(rig, {camera: "synthetic"})
 
 
+class Remarks(Listener):
+    def __init__(self) -> None:
+        self.texts: list[str] = []
+
+    def remark(self, text: str) -> None:
+        self.texts.append(text)
+
+
 def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was(
     rig: Rig, scene: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,6 +145,8 @@ def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was
         return Pose.level([0.3 * (time - 5.2), 0.05, 0.4])
 
     class Live:
+        late = 3
+
         def __init__(self, _source: str, camera: Camera, **_: object) -> None:
             self._eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
 
@@ -147,9 +157,12 @@ def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was
     monkeypatch.setattr("executor.track.LiveCamera", Live)
     front = replace(rig.cameras[0], latency=0.02)
     side = replace(other_side(front), latency=0.12)
-    result = track_sources(replace(rig, cameras=(front, side)), {front: "0", side: "1"})
+    listener = Remarks()
+    both = replace(rig, cameras=(front, side))
+    result = track_sources(both, {front: "0", side: "1"}, listener=listener)
     assert result.together is not None
     assert result.together.without_partner == 0
+    assert "camera front: 3 images came late and were skipped" in listener.texts[0]
     assert len(result.poses) == 5
     for found in result.poses:
         assert found.pose.distance_to(pose_at(found.time)) < 1e-3
@@ -182,14 +195,6 @@ def test_an_image_that_a_camera_lost_shifts_none_of_its_others(
     assert [found.time for found in result.poses] == pytest.approx([0.0, 0.1, 0.2])
     for found, pose in zip(result.poses, TRUTH, strict=True):
         assert found.pose.distance_to(pose) < 1e-3
-
-
-class Remarks(Listener):
-    def __init__(self) -> None:
-        self.texts: list[str] = []
-
-    def remark(self, text: str) -> None:
-        self.texts.append(text)
 
 
 def test_images_missing_in_all_folders_are_remarked_on(

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from model.files.camera_file import APRILTAG_FAMILIES
 from model.pose import Array
 from model.rig import Camera
-from model.tag_families import APRILTAG_FAMILIES
 from tracking.camera_model import Image, distort_pixels, linear
 from tracking.detection.detector import TagDetector
 from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror

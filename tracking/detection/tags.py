@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput
+from model.files.camera_file import FAMILIES, drawn_upside_down, opencv_dictionary, tags_in
 from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Tag
-from model.tag_families import FAMILIES, drawn_upside_down, opencv_dictionary, tags_in
 from tracking.camera_model import Image
 
 #: Top left, top right, bottom right, bottom left of the upright image, in half sides.

@@ -121,7 +121,8 @@ def readout(
     source: Path = argument("video file, or folder of images", "SOURCE"),
     camera: str | None = CAMERA,
     rate_hz: float | None = option(
-        "images per second of a folder (default: the camera's)", min=0.1
+        "images per second of a folder, or of a video without times (default: the camera's)",
+        min=0.1,
     ),
     speed_mm_s: float | None = option("speed for the error bound (default: the motion's)", min=0.1),
     calibration: list[Path] | None = CALIBRATION,

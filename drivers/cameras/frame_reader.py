@@ -1,0 +1,237 @@
+"""The newest image of a camera that delivers them faster than they are used.
+
+Images wait in queues of the network, the driver and the decoder. A reader slower than the camera
+would measure ever older images, so a thread reads all of them and keeps the last.
+
+After a pause of the network or the computer those that waited come in quick succession. How long
+each waited is unknown, so they are skipped: none gets the present time.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+#: Consecutive failed reads after which a camera counts as lost.
+LOST_IMAGES = 5
+#: The same without a new image on time for this long, [s]. A video codec may repeat an image of a
+#: platform at rest up to its next complete one, for 10 s and more.
+FROZEN = 60.0
+#: Longest wait for the reading thread when closing, and interval of checks for a stop, [s].
+END_TIMEOUT, ROUND = 2.0, 0.1
+NOT_OPENED = "cannot be opened"
+"""Why a camera delivers no images, as a predicate."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arrived:
+    """An image as delivered.
+
+    Attributes:
+        number: Number of the camera's image from 0, including skipped ones.
+        time: Time of arrival on the reader's clock, [s].
+        picture: As the camera delivered it.
+    """
+
+    number: int
+    time: float
+    picture: NDArray[np.generic]
+
+
+# Which images came on time. Their exposures are not known, only when each was read.
+
+
+#: Largest lateness of an image on time, [s]: a platform at 20 mm/s moves 1 mm meanwhile. Network,
+#: driver and scheduler delay single images by 10 to 40 ms.
+TOLERANCE = 0.05
+#: Images of this long after the first are skipped, [s]. To find a stream's format, FFmpeg stores up
+#: to 5 s of images, which then come as fast as they are decoded, mostly within 1 s.
+START = 2.0
+#: Images come evenly if at least so many intervals, lasting at least so long [s], differ by at most
+#: `TOLERANCE`: a single pause, or an image decoded slowly among ones that waited, is no pace.
+EVEN_INTERVALS, EVEN_TIME = 3, 0.25
+#: At a shorter share of the usual interval, images that waited are being read. Also so much of the
+#: usual interval counts for each image skipped: the camera may have lost others before.
+DRAINING = 0.9
+#: The usual interval is the mean over this long, [s]: the times of the images that waited are
+#: predicted from it, to `TOLERANCE` for some seconds, and it follows a change of the exposure.
+USUAL_TIME = 5.0
+
+
+class ArrivalSchedule:
+    """Judges by their arrivals which images of a camera came on time.
+
+    An image is on time if it came at most `TOLERANCE` after it was due: one usual interval after
+    the last one on time was due, and `DRAINING` of it more for each image skipped between them. If
+    there are any, the reader must also have waited for it, for half the usual interval.
+
+    Otherwise it may have waited, until images come evenly and not faster than usual: then none
+    waits. So the camera may lose images, or take fewer per second. If it takes more, images are
+    early; that is the new usual interval once they come evenly.
+    """
+
+    def __init__(self) -> None:
+        """Starts without images."""
+        self._number, self._begin, self._due = -1, 0.0, 0.0
+        self._recent: deque[float] = deque()
+        self._on_time: deque[tuple[int, float]] = deque()
+
+    def is_on_time(self, now: float) -> bool:
+        """Takes the arrival of the next image, [s]; returns whether it did not wait before."""
+        self._number += 1
+        self._begin = self._begin if self._number else now
+        recent = self._recent
+        recent.append(now)
+        while len(recent) > EVEN_INTERVALS + 1 and now - recent[1] >= EVEN_TIME:
+            recent.popleft()
+        intervals = [after - before for before, after in pairwise(recent)]
+        is_even = (
+            len(intervals) >= EVEN_INTERVALS
+            and now - recent[0] >= EVEN_TIME
+            and max(intervals) - min(intervals) <= TOLERANCE
+        )
+        if self._on_time:
+            least = DRAINING * self._usual * len(intervals)
+            is_faster = now - recent[0] < least
+            if self._is_due(now, intervals[-1]):
+                if is_even and is_faster:
+                    self._restart()
+                return True
+            if is_faster:
+                return False
+        if is_even and now - self._begin >= START:
+            self._restart()
+            self._due = now
+            return True
+        return False
+
+    @property
+    def _usual(self) -> float:
+        """Mean interval of the images on time, [s]."""
+        (first, began), (last, ended) = self._on_time[0], self._on_time[-1]
+        return (ended - began) / (last - first)
+
+    def _is_due(self, now: float, interval: float) -> bool:
+        """Whether an image came when due, or before; if so it is the last one on time."""
+        usual, skipped = self._usual, self._number - self._on_time[-1][0] - 1
+        due = self._due + usual * (1.0 + DRAINING * skipped)
+        if now - due > TOLERANCE:
+            return False
+        # If the camera now takes more, images seem to catch up too soon, and are ever
+        # earlier; so that none is skipped for ever, those `START` before they are due count.
+        if skipped and interval < usual / 2.0 and due - now < START:
+            return False
+        self._due = min(now, due)
+        self._on_time.append((self._number, now))
+        while len(self._on_time) > EVEN_INTERVALS + 1 and now - self._on_time[1][1] > USUAL_TIME:
+            self._on_time.popleft()
+        return True
+
+    def _restart(self) -> None:
+        """Takes the pace of the last images as the usual one."""
+        self._on_time = deque(enumerate(self._recent, self._number + 1 - len(self._recent)))
+
+
+class FrameReader:
+    """Opens a camera and reads all its images in a thread.
+
+    Images that waited in a queue are skipped. A copy of the image before is not a new one: noise
+    makes images of a camera differ, but a decoder or driver that hangs may repeat its last one.
+
+    Attributes:
+        lost: Why the camera delivers no more, as a predicate of it.
+        late: Number of images skipped as they may have waited, since the first on time.
+    """
+
+    def __init__(self, opened: Callable[[], cv2.VideoCapture], clock: Callable[[], float]) -> None:
+        """Starts the thread.
+
+        Args:
+            opened: Opens the camera, called by the thread: it may take half a minute.
+            clock: Monotonic time, [s].
+        """
+        self._opened, self._clock = opened, clock
+        self._changed = threading.Condition()
+        self._newest: Arrived | None = None
+        self.lost, self.late = "", 0
+        self._ended = self._is_closing = False
+        self._thread = threading.Thread(target=self._read, name="cdpr-pictures", daemon=True)
+        self._thread.start()
+
+    def newest(self, stopped: Callable[[], bool]) -> Arrived | None:
+        """Waits for the newest image on time that was not returned before.
+
+        Args:
+            stopped: Called repeatedly; True ends the wait.
+
+        Returns:
+            None once the camera delivers no more, or the wait was ended.
+        """
+        with self._changed:
+            while not self._changed.wait_for(lambda: self._newest or self._ended, ROUND):
+                if stopped():
+                    break
+            newest, self._newest = self._newest, None
+            return newest
+
+    def close(self) -> None:
+        """Stops the thread; a hanging camera keeps it until this process ends."""
+        self._is_closing = True
+        if threading.current_thread() is not self._thread:
+            self._thread.join(END_TIMEOUT)
+
+    def _read(self) -> None:
+        try:
+            capture = self._opened()
+            try:
+                self._read_all(capture)
+            finally:
+                capture.release()
+        finally:
+            with self._changed:
+                self._ended = True
+                self._changed.notify_all()
+
+    def _read_all(self, capture: cv2.VideoCapture) -> None:
+        """Puts each image of a camera until that is lost, or this closed."""
+        number = failed = 0
+        last: Arrived | None = None
+        schedule, latest, is_used = ArrivalSchedule(), self._clock() + FROZEN, False
+        self.lost = "" if capture.isOpened() else NOT_OPENED
+        while not (self.lost or self._is_closing):
+            good, picture = capture.read()
+            now = self._clock()
+            failed = 0 if good else failed + 1
+            if failed == LOST_IMAGES:
+                self.lost = f"failed to deliver an image {LOST_IMAGES} times in a row"
+            if not good:
+                continue
+            arrived = Arrived(number, now, np.asarray(picture))
+            number += 1
+            is_on_time = schedule.is_on_time(now)
+            is_copy = last is not None and _is_copy(arrived.picture, last.picture)
+            last = last if is_copy else arrived
+            self.late += is_used and not is_on_time
+            if is_on_time and not (is_copy and is_used):
+                is_used, latest = True, now + FROZEN
+                self._put(arrived)
+            elif now > latest:
+                what = "the same image" if is_copy else "no image on time"
+                self.lost = f"delivered {what} for {FROZEN:g} s"
+
+    def _put(self, arrived: Arrived) -> None:
+        with self._changed:
+            self._newest = arrived
+            self._changed.notify_all()
+
+
+def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
+    """Whether two images are equal; a few of their rows suffice for most that are not."""
+    return np.array_equal(picture[::64], last[::64]) and np.array_equal(picture, last)

@@ -1,0 +1,130 @@
+"""Images that waited in a queue get no time; those of a healthy camera do."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from random import Random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from drivers.cameras.frame_reader import EVEN_INTERVALS, START, TOLERANCE, ArrivalSchedule
+
+RATES = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0, 100.0, 200.0)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """An image: when it was taken and read, and whether it counts as on time."""
+
+    taken: float
+    read: float
+    is_on_time: bool
+
+    @property
+    def lateness(self) -> float:
+        return self.read - self.taken
+
+
+def judged(
+    exposures: list[float],
+    *,
+    pause: tuple[float, float] = (0.0, 0.0),
+    decoding: float = 1e-3,
+    jitter: float = 0.0,
+    places: int = 10**6,
+    seed: int = 1,
+) -> list[Judged]:
+    """Images through a queue, in order, and none read during the pause; a full queue takes none."""
+    random, schedule = Random(seed), ArrivalSchedule()
+    queue: deque[float] = deque()
+    coming = deque((taken + random.uniform(0.0, jitter), taken) for taken in exposures)
+    now, images = 0.0, []
+    while coming or queue:
+        if not queue:
+            now = max(now, coming[0][0])
+        if pause[0] <= now < pause[1]:
+            now = pause[1]
+        while coming and coming[0][0] <= now:
+            _, taken = coming.popleft()
+            if len(queue) < places:
+                queue.append(taken)
+        taken = queue.popleft()
+        now += decoding
+        images.append(Judged(taken, now, schedule.is_on_time(now)))
+    return images
+
+
+def at_rate(rate: float, seconds: float, begin: float = 0.0) -> list[float]:
+    return [begin + k / rate for k in range(int(seconds * rate))]
+
+
+@given(
+    rate=st.sampled_from(RATES),
+    length=st.floats(0.0, 5.0),
+    share=st.floats(0.01, 0.5),
+    jitter=st.floats(0.0, 0.02),
+    places=st.sampled_from([4, 10, 10**6]),
+    seed=st.integers(0, 9),
+)
+def test_no_image_that_waited_gets_the_present_time(
+    rate: float, length: float, share: float, jitter: float, places: int, seed: int
+) -> None:
+    begin = START + (EVEN_INTERVALS + 5) / rate
+    recovered = begin + length + 2.0 * (EVEN_INTERVALS + 2) / rate + length + 1.0
+    images = judged(
+        at_rate(rate, recovered + 3.0 + 5.0 / rate),
+        pause=(begin, begin + length),
+        decoding=min(0.02, share / rate),
+        jitter=min(jitter, 0.2 / rate),
+        places=places,
+        seed=seed,
+    )
+    used = [image for image in images if image.is_on_time]
+    assert max(image.lateness for image in used) <= 2.0 * TOLERANCE
+    after = [image.is_on_time for image in images if image.taken > recovered]
+    assert sum(after) >= 0.9 * len(after)
+
+
+@pytest.mark.parametrize("rate", RATES)
+@pytest.mark.parametrize("new", [0.34, 0.5, 0.7, 1.5, 3.0])
+@pytest.mark.parametrize("gap", [0.0, 0.3, 2.0])
+def test_a_camera_may_change_its_rate(rate: float, new: float, gap: float) -> None:
+    """Its exposure follows the light; it may pause meanwhile."""
+    change = START + 10.0 / rate
+    exposures = at_rate(rate, change) + at_rate(new * rate, 30.0 + 20.0 / rate, change + gap)
+    images = judged(exposures)
+    settled = change + gap + 6.0 + 8.0 / (new * rate)
+    assert all(image.is_on_time for image in images if image.taken > settled)
+
+
+def test_images_stored_while_the_camera_opened_are_skipped() -> None:
+    """FFmpeg reads some seconds of a stream to find its format."""
+    images = judged(at_rate(20.0, 20.0), pause=(0.0, 5.0), decoding=0.01)
+    assert not any(image.is_on_time for image in images if image.lateness > 0.02)
+    assert all(image.is_on_time for image in images if image.taken > 5.0 + START + 0.3)
+
+
+@pytest.mark.parametrize("rate", [5.0, 10.0, 30.0, 100.0])
+def test_a_camera_that_loses_images_stays_in_use(rate: float) -> None:
+    """Every tenth image is lost, also while the camera opens."""
+    exposures = [taken for k, taken in enumerate(at_rate(rate, 60.0)) if k % 10]
+    used = [image.is_on_time for image in judged(exposures) if image.taken > START + 2.0]
+    assert sum(used) > 0.5 * len(used)
+
+
+def test_a_camera_of_uneven_images_stays_in_use() -> None:
+    """As one on a busy wireless network: what came in time counts."""
+    images = judged(at_rate(10.0, 60.0), jitter=0.1)
+    used = [image for image in images if image.is_on_time]
+    assert len(used) > 0.2 * len(images)
+    assert max(image.lateness for image in used) < 0.1 + TOLERANCE
+
+
+def test_the_images_of_a_stalled_reader_are_skipped_until_none_waits() -> None:
+    """The case of a whole second at 20 images/s, image by image."""
+    images = judged(at_rate(20.0, 8.0), pause=(5.0, 6.0), decoding=0.01)
+    skipped = [image for image in images if not image.is_on_time and image.taken > START + 1.0]
+    assert (round(skipped[0].taken, 2), len(skipped)) == (5.0, 30)  # 20 waited
