@@ -80,8 +80,8 @@ def delete_unused(parent: Path, now: float) -> None:
 
 
 def _own_folder() -> Path:
-    cache_home = os.environ.get("XDG_CACHE_HOME")
-    parent = Path(cache_home) if cache_home else Path.home() / ".cache"
+    cache_home = os.environ.get("XDG_CACHE_HOME", "")
+    parent = Path(cache_home) if os.path.isabs(cache_home) else Path.home() / ".cache"
     return parent / "cdpr" / "kernels"
 
 
