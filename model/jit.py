@@ -173,9 +173,9 @@ def _version(folders: frozenset[Path]) -> str:
 
 # Whether the machine code of a task is in the user's cache, or must be compiled first.
 #
-# Numba finds machine code by the path of a kernel's file and its content, before 0.68 by its date and
-# size instead, in a folder named as above. Another copy of the program compiles again; hence the
-# stamp of a task is named after the path of every kernel's file, and before 0.68 date and size.
+# Numba finds machine code by the path of a kernel's file and its content, before 0.68 by its date
+# and size instead, in a folder named as above. Another copy of the program compiles again; hence
+# the stamp of a task is named after the path of every kernel's file, and before 0.68 date and size.
 
 
 _FINDS_BY_DATE = numba.version_info.short < (0, 68)
