@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
+from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup
 
 import cdpr
@@ -222,7 +223,7 @@ def build_app() -> typer.Typer:
     """The whole command line."""
     app = typer.Typer(
         cls=LazyGroup,
-        epilog=EPILOG,
+        epilog=escape(EPILOG),
         no_args_is_help=True,
         add_completion=True,
         rich_markup_mode="rich",
