@@ -23,7 +23,10 @@ from model.pose import Array
 MOST_POINTS = 900
 _SIZE = 1000.0
 """Width and height of the inner SVG's coordinates."""
-DASHED, DOTTED, DASH_DOTTED = "6 4", "1.5 3", "8 3 1.5 3"
+DASHED, DOTTED, DASH_DOTTED = "dashed", "dotted", "dash-dotted"
+"""CSS variables of the dash patterns, in `base.css`."""
+_SERIES = 8
+"""Number of the colours of `base.css` for lines of one kind."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +39,7 @@ class ChartLine:
         y: Shape (n,).
         role: CSS variable of its colour, such as ``encoder``.
         width: [px].
-        dash: SVG dash pattern; empty for a full line.
+        dash: CSS variable of its dash pattern, such as `DASHED`; empty for a full line.
         opacity: 1 for opaque.
         band: Lower and upper edge of a band around it, each of shape (n,).
         fits: Whether the range of y includes it.
@@ -101,6 +104,11 @@ class Chart:
     group: str = "time"
 
 
+def series_style(index: int) -> tuple[str, str]:
+    """Role and dash of one of several lines of one kind, such as of a cable; 24 are different."""
+    return f"series{index % _SERIES + 1}", ("", DASHED, DASH_DOTTED)[index // _SERIES % 3]
+
+
 def charts(*parts: Chart) -> str:
     """Charts below each other; HTML."""
     return "".join(map(_figure, parts))
@@ -141,10 +149,15 @@ def _legend(chart: Chart) -> str:
 
 
 def _stroke(line: ChartLine) -> str:
-    dash = f";stroke-dasharray:{line.dash}" if line.dash else ""
+    return f'fill="none" vector-effect="non-scaling-stroke" style="{_style(line)}"'
+
+
+def _style(line: ChartLine) -> str:
+    """CSS of a line in the chart, in its legend and under the pointer."""
+    dash = f";stroke-dasharray:var(--{line.dash})" if line.dash else ""
     return (
-        f'fill="none" vector-effect="non-scaling-stroke" style="stroke:var(--{line.role});'
-        f'stroke-width:{line.width:g}px;stroke-opacity:{line.opacity:g}{dash}"'
+        f"stroke:var(--{line.role});stroke-width:{line.width:g}px;"
+        f"stroke-opacity:{line.opacity:g}{dash}"
     )
 
 
@@ -270,7 +283,7 @@ def _data(chart: Chart, low: float, high: float) -> str:
 
 
 def _line_data(line: ChartLine) -> dict[str, Any]:
-    found: dict[str, Any] = {"name": line.name, "role": line.role, "fits": line.fits}
+    found: dict[str, Any] = {"name": line.name, "stroke": _style(line), "fits": line.fits}
     found |= {"x": _column(line.x), "y": _column(line.y)}
     if line.band is not None:
         found |= {"low": _column(line.band[0]), "high": _column(line.band[1])}

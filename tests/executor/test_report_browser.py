@@ -1,0 +1,61 @@
+"""The page of a run in a real browser: lines that can be told apart, and texts that can be read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser, Page
+
+from executor.report.figures import length_figure
+from model.pages.page import page as html_page
+from tests.console import browsing
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+CABLES = 24
+#: Colour and dashes of each element that a selector finds.
+STYLES = """(all) => all.map((e) => [getComputedStyle(e).stroke,
+getComputedStyle(e).strokeDasharray].join())"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with browsing.browser_at(browsing.chromium(), webgl=False) as browser:
+        yield browser
+
+
+@pytest.fixture
+def lengths(tmp_path: Path) -> Path:
+    """A page with the chart of the lengths of as many cables as a rig can have."""
+    time = np.linspace(0.0, 10.0, 50)
+    columns = 1.0 + 0.1 * np.sin(time[:, None] + np.arange(CABLES))
+    cycles = SimpleNamespace(time=time, lengths=columns, cable_count=CABLES)
+    run: Any = SimpleNamespace(cycles=cycles)
+    path = tmp_path / "page.html"
+    path.write_text(html_page("Lengths", length_figure(run), scripts=("charts.js",)))
+    return path
+
+
+@contextmanager
+def opened(browser: Browser, path: Path, **more: Any) -> Iterator[Page]:
+    context = browser.new_context(**more)
+    page = context.new_page()
+    page.goto(path.as_uri())
+    yield page
+    context.close()
+
+
+def test_each_cable_has_a_line_of_its_own_style_in_the_chart_and_under_the_pointer(
+    browser: Browser, lengths: Path
+) -> None:
+    """Cables 1 and 9 had the same."""
+    with opened(browser, lengths) as page:
+        drawn = page.locator(".lines path").evaluate_all(STYLES)
+        assert len(set(drawn)) == CABLES
+        page.locator(".plot svg[role=img]").hover()
+        assert page.locator(".readout path").evaluate_all(STYLES) == drawn
