@@ -58,7 +58,7 @@
 
   /** Texts that do not fit in their element. */
   cut() {
-    return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value")
+    return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value, #jog-said, #cable-said")
       .filter((e) => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1)
       .map(this.nameOf);
   },

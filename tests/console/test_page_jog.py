@@ -308,6 +308,21 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             assert found.page.locator("#jog-pad").bounding_box() == before, size
 
 
+@pytest.mark.parametrize(("ready", "button"), [("jog", "+z"), ("jog_cables", "wind_in")])
+def test_the_reason_why_a_press_ended_is_shown_whole(phone: Visit, ready: str, button: str) -> None:
+    """It was cut to "End…" beside the state, and a finger opens no tooltip."""
+    getattr(phone, f"ready_to_{ready}")()
+    phone.hold(button)
+    assert phone.audit("cut") == []
+    phone.page.evaluate("() => window.dispatchEvent(new Event('blur'))")
+    phone.page.mouse.up()
+    words = phone.page.locator(f"#{ready.split('_')[-1].removesuffix('s')}-words .heading")
+    expect(words).to_contain_text("Ended: the window lost the focus")
+    expect(words).to_contain_text("Ready: hold a button to move")
+    assert phone.audit("cut") == []
+    assert phone.audit("overlapping") == []
+
+
 def test_random_sequences_hold_only_what_is_pressed(desk: Visit) -> None:
     """100 000 events: nothing is held unpressed, refused, after its end or after a gap."""
     sequences = (Path(__file__).parent / "hold_sequences.js").read_text(encoding="utf-8")
