@@ -213,7 +213,7 @@ def length_figure(run: RunData) -> str:
             lines,
             _whole(run),
             names_at_ends=True,
-            height=280,
+            height=max(280, 14 * cycles.cable_count),
         )
     )
 

@@ -249,7 +249,7 @@ def _polyline(points: Iterable[tuple[float, float]]) -> str:
 
 
 def _names(chart: Chart, low: float, high: float) -> str:
-    """Names at the right ends of lines, spread so that they do not overlap."""
+    """Names at the right ends of lines with a piece of each, spread so that none overlap."""
     if not chart.names_at_ends:
         return ""
     lines = [line for line in chart.lines if line.name and np.isfinite(line.y).any()]
@@ -257,8 +257,8 @@ def _names(chart: Chart, low: float, high: float) -> str:
     ends = [(high - value) / (high - low) for value in last]
     label_ys = spread(ends, 14.0 / chart.height)
     return "".join(
-        f'<text x="100%" dx="6" y="{label_y:.2%}" dy="4" style="fill:var(--{line.role})">'
-        f"{escape(line.name)}</text>"
+        f'<svg x="100%" y="{label_y:.2%}"><path d="M6 0H22" {_stroke(line)}/>'
+        f'<text x="26" dy="4">{escape(line.name)}</text></svg>'
         for line, label_y in zip(lines, label_ys, strict=True)
     )
 

@@ -12,12 +12,16 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, Page
 
+from executor.recording.run_folder import RunFolder
+from executor.report import build_report
 from executor.report.figures import length_figure
 from model.pages.page import page as html_page
 from tests.console import browsing
+from tests.executor import fake_run
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 CABLES = 24
+AUDITS = browsing.AUDITS.split("*/", 1)[1].strip()
 #: Colour and dashes of each element that a selector finds.
 STYLES = """(all) => all.map((e) => [getComputedStyle(e).stroke,
 getComputedStyle(e).strokeDasharray].join())"""
@@ -59,3 +63,24 @@ def test_each_cable_has_a_line_of_its_own_style_in_the_chart_and_under_the_point
         assert len(set(drawn)) == CABLES
         page.locator(".plot svg[role=img]").hover()
         assert page.locator(".readout path").evaluate_all(STYLES) == drawn
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_texts_of_a_report_have_the_contrast_of_wcag_aa(
+    browser: Browser, tmp_path: Path, scheme: Any
+) -> None:
+    """The names of the cables had that of their lines, 2.9 for cable 6."""
+    folder = fake_run.write(fake_run.make(rate_hz=2.0, every=20), tmp_path / "run")
+    report = build_report(RunFolder.open(folder.path))
+    with opened(browser, report, color_scheme=scheme) as page:
+        assert page.evaluate(f"() => ({AUDITS}).weak()") == []
+        names = page.locator(".names text")
+        assert names.all_text_contents() == [f"cable {k + 1}" for k in range(8)]
+
+
+def test_a_name_at_the_end_of_a_line_has_a_piece_of_that_line(
+    browser: Browser, lengths: Path
+) -> None:
+    with opened(browser, lengths) as page:
+        drawn = page.locator(".lines path").evaluate_all(STYLES)
+        assert page.locator(".names path").evaluate_all(STYLES) == drawn
