@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
+from unicodedata import east_asian_width
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,8 @@ _SIZE = 1000.0
 """Width and height of the inner SVG's coordinates."""
 DASHED, DOTTED, DASH_DOTTED = "dashed", "dotted", "dash-dotted"
 """CSS variables of the dash patterns, in `base.css`."""
+_COLUMN = 7.0
+"""Mean width of a letter of 11 px, [px]."""
 _SERIES = 8
 """Number of the colours of `base.css` for lines of one kind."""
 
@@ -58,7 +61,7 @@ class ChartLine:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A shaded interval of x, and its name; empty for none."""
+    """A shaded interval of x, and its name, cut if too long for the chart; empty for none."""
 
     begin: float
     end: float
@@ -206,8 +209,19 @@ def _ticks(chart: Chart, low: float, high: float) -> str:
     parts.append(f'<text class="unit end" x="100%" y="100%" dy="31">{x_name}</text>')
     for span in chart.spans:
         at = f"{((span.begin + span.end) / 2.0 - begin) / (end - begin):.4%}"
-        parts.append(f'<text class="span" x="{at}" y="4">{escape(span.name)}</text>')
+        name = escape(_shortened(span.name, chart.height))
+        parts.append(f'<text class="span" x="{at}" y="4">{name}</text>')
     return "".join(parts)
+
+
+def _shortened(name: str, height: float) -> str:
+    """A vertical name, cut where it would reach beyond a chart of this height, [px]."""
+    columns = 0
+    for k, letter in enumerate(name):
+        columns += 2 if east_asian_width(letter) in "WF" else 1
+        if columns > (height - 8.0) / _COLUMN:
+            return f"{name[: k - 1]}…"
+    return name
 
 
 def _of(chart: Chart) -> str:
@@ -275,7 +289,7 @@ def _data(chart: Chart, low: float, high: float) -> str:
         "xUnit": chart.x_unit,
         "log": chart.logarithmic,
         "zero": chart.from_zero,
-        "spans": [[s.begin, s.end, s.name] for s in chart.spans],
+        "spans": [[s.begin, s.end, _shortened(s.name, chart.height)] for s in chart.spans],
         "lines": [_line_data(line) for line in chart.lines],
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)

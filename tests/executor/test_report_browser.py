@@ -15,6 +15,7 @@ from playwright.sync_api import Browser, Page
 from executor.recording.run_folder import RunFolder
 from executor.report import build_report
 from executor.report.figures import length_figure
+from model.pages.charts import Chart, ChartLine, Span, charts
 from model.pages.page import page as html_page
 from tests.console import browsing
 from tests.executor import fake_run
@@ -76,6 +77,31 @@ def test_the_texts_of_a_report_have_the_contrast_of_wcag_aa(
         assert page.evaluate(f"() => ({AUDITS}).weak()") == []
         names = page.locator(".names text")
         assert names.all_text_contents() == [f"cable {k + 1}" for k in range(8)]
+
+
+@pytest.mark.parametrize(
+    "name", ["A long name of a stop at the west side of the hall, in English", "停" * 60]
+)
+def test_a_long_name_of_a_stop_ends_within_its_chart(
+    browser: Browser, tmp_path: Path, name: str
+) -> None:
+    """It ran into the next chart; the table of stops has it whole."""
+    time, path = np.array([0.0, 10.0]), tmp_path / "page.html"
+    spans = (Span(2.0, 2.0, name), Span(5.0, 5.0, "short"))
+    line = ChartLine("x", time, time, "encoder")
+    chart = Chart("x", "x", "x", "mm", (line,), (0.0, 10.0), spans=spans, height=150)
+    path.write_text(html_page("Stops", charts(chart), scripts=("charts.js",)))
+    with opened(browser, path) as page:
+        names, area = page.locator("text.span"), page.locator(".area").bounding_box()
+        assert area is not None
+        for _ in range(2):
+            box = names.first.bounding_box()
+            assert box is not None
+            assert area["y"] < box["y"] + 100.0 < box["y"] + box["height"] < area["y"] + 150.0
+            first, short = names.all_text_contents()
+            assert first == f"{name[: len(first) - 1]}…"
+            assert short == "short"
+            page.locator(".plot svg[role=img]").press("+")  # the script draws it again
 
 
 def test_a_name_at_the_end_of_a_line_has_a_piece_of_that_line(
