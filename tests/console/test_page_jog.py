@@ -107,6 +107,21 @@ def test_a_pad_does_not_have_the_focus_again_after_stale_data(desk: Visit) -> No
     assert desk.fake.received("held") == []
 
 
+def test_a_pointer_that_slides_off_its_button_holds_it_until_it_is_lifted(desk: Visit) -> None:
+    """As docs/console.md states it; the button has captured the pointer."""
+    desk.ready_to_jog()
+    number = desk.hold("+z")
+    other = desk.move_to('[data-jog="-x"]')
+    expect(desk.page.locator('[data-jog="+z"]')).to_have_class("held")
+    found = desk.fake.let_pass(desk.page)
+    assert [m["hold"] for m in found["received"] if m["kind"] == "let_go"] == []
+    assert {m["hold"] for m in found["received"] if m["kind"] == "held"} == {number}
+    other.up()
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
+    expect(desk.page.locator("#jog-said")).to_have_text("Released")
+    expect(desk.page.locator("[data-jog].held")).to_have_count(0)
+
+
 def test_a_held_jog_ends_for_good(desk: Visit) -> None:
     desk.ready_to_jog()
     end_one_after_another(desk, "+x")

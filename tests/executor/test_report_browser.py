@@ -80,7 +80,9 @@ def test_the_texts_of_a_report_have_the_contrast_of_wcag_aa(
 
 
 @pytest.mark.parametrize(
-    "name", ["A long name of a stop at the west side of the hall, in English", "停" * 60]
+    "name",
+    ["A long name of a stop at the west side of the hall, in English", "停" * 60],
+    ids=["words", "ideographs"],
 )
 def test_a_long_name_of_a_stop_ends_within_its_chart(
     browser: Browser, tmp_path: Path, name: str
