@@ -80,8 +80,8 @@ def delete_unused(parent: Path, now: float) -> None:
 
 
 def _own_folder() -> Path:
-    cache_home = os.environ.get("XDG_CACHE_HOME")
-    parent = Path(cache_home) if cache_home else Path.home() / ".cache"
+    cache_home = os.environ.get("XDG_CACHE_HOME", "")
+    parent = Path(cache_home) if os.path.isabs(cache_home) else Path.home() / ".cache"
     return parent / "cdpr" / "kernels"
 
 
@@ -173,9 +173,12 @@ def _version(folders: frozenset[Path]) -> str:
 
 # Whether the machine code of a task is in the user's cache, or must be compiled first.
 #
-# Numba finds machine code by the path and date of a kernel's file, in a folder named as above.
-# Another copy of the program, or a file that was only touched, compiles again; hence the stamp of a
-# task is named after path, date and size of every kernel's file.
+# Numba finds machine code by the path of a kernel's file and its content, before 0.68 by its date
+# and size instead, in a folder named as above. Another copy of the program compiles again; hence
+# the stamp of a task is named after the path of every kernel's file, and before 0.68 date and size.
+
+
+_FINDS_BY_DATE = numba.version_info.short < (0, 68)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,5 +255,6 @@ def _stamp(task: KernelSet) -> Path | None:
     for kernels in task.kernels:
         for source in sorted(kernels.glob("*.py")):
             state = source.stat()
-            digest.update(f"{source} {state.st_mtime_ns} {state.st_size}\n".encode())
+            seen = (state.st_mtime_ns, state.st_size) if _FINDS_BY_DATE else ()
+            digest.update(f"{source} {seen}\n".encode())
     return folder / f"compiled-{task.name}-{digest.hexdigest()[:16]}"

@@ -42,6 +42,19 @@ def lazy_names(
     return load, listed
 
 
+def hidden_package(error: ImportError) -> tuple[str, str] | None:
+    """The package of ours whose import failed, and the file or folder of the user that hides it.
+
+    None where the error has another cause.
+    """
+    package = str(error.name).partition(".")[0]
+    found = sys.modules.get(package)
+    places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
+    theirs = [path for path in places if path and not Path(path).is_relative_to(_ROOT)]
+    is_ours = (_ROOT / package / "__init__.py").is_file()
+    return (package, theirs[0]) if is_ours and theirs else None
+
+
 def _imported(module: str) -> ModuleType:
     """A module of this project.
 
@@ -51,12 +64,9 @@ def _imported(module: str) -> ModuleType:
     try:
         return import_module(module)
     except ImportError as error:
-        package = str(error.name).partition(".")[0]
-        found = sys.modules.get(package)
-        places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
-        theirs = [path for path in places if path and not Path(path).is_relative_to(_ROOT)]
-        if not (_ROOT / package / "__init__.py").is_file() or not theirs:
+        if (hidden := hidden_package(error)) is None:
             raise
+        package, path = hidden
         raise ImportError(
-            f"{theirs[0]} hides the package `{package}` of cdpr: rename it", path=theirs[0]
+            f"{path} hides the package `{package}` of cdpr: rename it", name=package, path=path
         ) from error

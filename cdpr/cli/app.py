@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import typer
+from rich.markup import escape
 from typer.core import TyperCommand, TyperGroup
 
 import cdpr
@@ -32,6 +33,7 @@ from model.errors import (
     without_passwords,
 )
 from model.files.reading import ready_folder, shown
+from model.lazy import hidden_package
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,7 +223,7 @@ def build_app() -> typer.Typer:
     """The whole command line."""
     app = typer.Typer(
         cls=LazyGroup,
-        epilog=EPILOG,
+        epilog=escape(EPILOG),
         no_args_is_help=True,
         add_completion=True,
         rich_markup_mode="rich",
@@ -269,6 +271,7 @@ def main() -> None:
             )
         )
     except Exception as error:
+        _refuse_hidden_package(error)
         _print_defect(error)
         sys.exit(1)
     finally:
@@ -333,6 +336,20 @@ def _from_os_error(error: OSError) -> CdprError:
         )
     hint = "check the output's destination and its free space"
     return Fault("the command could not write all its output", why=why, next_step=hint)
+
+
+def _refuse_hidden_package(error: Exception) -> None:
+    """Reports the user's file or folder, where it hides one of our packages, and exits."""
+    if isinstance(error, ImportError) and (hidden := hidden_package(error)):
+        package, path = hidden
+        _exit_with(
+            BadInput(
+                f"this file or folder hides the package `{package}` of cdpr",
+                where=shown(path),
+                why="Python finds it first, as in a folder of PYTHONPATH",
+                next_step="take that folder out of PYTHONPATH (unset PYTHONPATH), or rename it",
+            )
+        )
 
 
 def _print_defect(error: Exception) -> None:

@@ -22,6 +22,7 @@ from model.pages.charts import (
     Span,
     chart_grid,
     charts,
+    series_style,
     thinned,
     with_gaps,
 )
@@ -198,8 +199,8 @@ def length_figure(run: RunData) -> str:
     """Length of every cable over time; HTML."""
     cycles = run.cycles
     lines = tuple(
-        _line(f"cable {i + 1}", cycles.time, cycles.lengths[:, i] * 1e3, f"series{i % 8 + 1}")
-        for i in range(cycles.cable_count)
+        _line(f"cable {i + 1}", cycles.time, cycles.lengths[:, i] * 1e3, role, dash=dash)
+        for i, (role, dash) in enumerate(map(series_style, range(cycles.cable_count)))
     )
     low, high = np.nanmin(cycles.lengths) * 1e3, np.nanmax(cycles.lengths) * 1e3
     text = f"Line chart of {cycles.cable_count} cable lengths, {low:.0f} to {high:.0f} mm."
@@ -212,7 +213,7 @@ def length_figure(run: RunData) -> str:
             lines,
             _whole(run),
             names_at_ends=True,
-            height=280,
+            height=max(280, 14 * cycles.cable_count),
         )
     )
 

@@ -104,29 +104,29 @@
     return Array.from({ length: Math.floor(high / step + 1e-9) - first + 1 }, (_, k) => (first + k) * step);
   }
 
+  function add(parent, tag, attributes, text = "") {
+    const element = parent.appendChild(document.createElementNS("http://www.w3.org/2000/svg", tag));
+    for (const [name, to] of Object.entries(attributes)) element.setAttribute(name, to);
+    return Object.assign(element, { textContent: text });
+  }
   function draw({ data, ticks, lines, x: [a, b], y: [low, high] }) {
     const [x0, x1] = data.x, [y0, y1] = data.y;
     const box = [(a - x0) / (x1 - x0), (y1 - high) / (y1 - y0), (b - a) / (x1 - x0), (high - low) / (y1 - y0)];
     lines.setAttribute("viewBox", box.map((part) => 1000 * part).join(" "));
     ticks.replaceChildren();
-    const add = (tag, attributes, text = "") => {
-      const element = ticks.appendChild(document.createElementNS("http://www.w3.org/2000/svg", tag));
-      for (const [name, to] of Object.entries(attributes)) element.setAttribute(name, to);
-      element.textContent = text;
-    };
     const across = (x) => `${((100 * (x - a)) / (b - a)).toFixed(3)}%`, up = (y) => `${((100 * (high - y)) / (high - low)).toFixed(3)}%`;
     for (const x of round(a, b, 6)) {
-      add("line", { x1: across(x), x2: across(x), y1: 0, y2: "100%" });
-      add("text", { class: "x", x: across(x), y: "100%", dy: 16 }, shown(x));
+      add(ticks, "line", { x1: across(x), x2: across(x), y1: 0, y2: "100%" });
+      add(ticks, "text", { class: "x", x: across(x), y: "100%", dy: 16 }, shown(x));
     }
     for (const y of round(low, high, 5).filter((y) => !data.log || Math.abs(y - Math.round(y)) < 1e-9)) {
-      add("line", { x1: 0, x2: "100%", y1: up(y), y2: up(y) });
-      add("text", { class: "y", x: 0, dx: -6, y: up(y), dy: 4 }, shown(data.log ? 10 ** y : y));
+      add(ticks, "line", { x1: 0, x2: "100%", y1: up(y), y2: up(y) });
+      add(ticks, "text", { class: "y", x: 0, dx: -6, y: up(y), dy: 4 }, shown(data.log ? 10 ** y : y));
     }
-    add("text", { class: "unit", x: 0, dx: -44, y: -7 }, data.quantity);
-    add("text", { class: "unit end", x: "100%", y: "100%", dy: 31 }, data.xQuantity);
+    add(ticks, "text", { class: "unit", x: 0, dx: -44, y: -7 }, data.quantity);
+    add(ticks, "text", { class: "unit end", x: "100%", y: "100%", dy: 31 }, data.xQuantity);
     for (const [middle, name] of data.spans.map(([from, to, name]) => [(from + to) / 2, name]))
-      if (middle > a && middle < b) add("text", { class: "span", x: across(middle), y: 4 }, name);
+      if (middle > a && middle < b) add(ticks, "text", { class: "span", x: across(middle), y: 4 }, name);
   }
 
   function read(plot, x) {
@@ -139,8 +139,8 @@
     for (const line of data.lines.filter((one) => one.name)) {
       const row = readout.appendChild(document.createElement("div")), y = value(line.x, line.y, x);
       const ends = line.low && !data.log ? ` (${text(value(line.x, line.low, x))} to ${text(value(line.x, line.high, x))})` : "";
-      row.style.setProperty("--of", `var(--${line.role})`);
-      row.textContent = `${line.name} ${text(y)} ${data.unit}${y === null ? "" : ends}`;
+      add(add(row, "svg", { width: 16, height: 10, "aria-hidden": true }), "path", { d: "M0 5H16", fill: "none", style: line.stroke });
+      row.append(`${line.name} ${text(y)} ${data.unit}${y === null ? "" : ends}`);
     }
     const left = ((x - a) / (b - a)) * svg.clientWidth, beyond = left > svg.clientWidth / 2;
     cursor.hidden = readout.hidden = false;

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
+from unicodedata import east_asian_width
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,12 @@ from model.pose import Array
 MOST_POINTS = 900
 _SIZE = 1000.0
 """Width and height of the inner SVG's coordinates."""
-DASHED, DOTTED, DASH_DOTTED = "6 4", "1.5 3", "8 3 1.5 3"
+DASHED, DOTTED, DASH_DOTTED = "dashed", "dotted", "dash-dotted"
+"""CSS variables of the dash patterns, in `base.css`."""
+_COLUMN = 7.0
+"""Mean width of a letter of 11 px, [px]."""
+_SERIES = 8
+"""Number of the colours of `base.css` for lines of one kind."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,7 +42,7 @@ class ChartLine:
         y: Shape (n,).
         role: CSS variable of its colour, such as ``encoder``.
         width: [px].
-        dash: SVG dash pattern; empty for a full line.
+        dash: CSS variable of its dash pattern, such as `DASHED`; empty for a full line.
         opacity: 1 for opaque.
         band: Lower and upper edge of a band around it, each of shape (n,).
         fits: Whether the range of y includes it.
@@ -55,7 +61,7 @@ class ChartLine:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A shaded interval of x, and its name; empty for none."""
+    """A shaded interval of x, and its name, cut if too long for the chart; empty for none."""
 
     begin: float
     end: float
@@ -101,6 +107,11 @@ class Chart:
     group: str = "time"
 
 
+def series_style(index: int) -> tuple[str, str]:
+    """Role and dash of one of several lines of one kind, such as of a cable; 24 are different."""
+    return f"series{index % _SERIES + 1}", ("", DASHED, DASH_DOTTED)[index // _SERIES % 3]
+
+
 def charts(*parts: Chart) -> str:
     """Charts below each other; HTML."""
     return "".join(map(_figure, parts))
@@ -141,10 +152,15 @@ def _legend(chart: Chart) -> str:
 
 
 def _stroke(line: ChartLine) -> str:
-    dash = f";stroke-dasharray:{line.dash}" if line.dash else ""
+    return f'fill="none" vector-effect="non-scaling-stroke" style="{_style(line)}"'
+
+
+def _style(line: ChartLine) -> str:
+    """CSS of a line in the chart, in its legend and under the pointer."""
+    dash = f";stroke-dasharray:var(--{line.dash})" if line.dash else ""
     return (
-        f'fill="none" vector-effect="non-scaling-stroke" style="stroke:var(--{line.role});'
-        f'stroke-width:{line.width:g}px;stroke-opacity:{line.opacity:g}{dash}"'
+        f"stroke:var(--{line.role});stroke-width:{line.width:g}px;"
+        f"stroke-opacity:{line.opacity:g}{dash}"
     )
 
 
@@ -193,8 +209,19 @@ def _ticks(chart: Chart, low: float, high: float) -> str:
     parts.append(f'<text class="unit end" x="100%" y="100%" dy="31">{x_name}</text>')
     for span in chart.spans:
         at = f"{((span.begin + span.end) / 2.0 - begin) / (end - begin):.4%}"
-        parts.append(f'<text class="span" x="{at}" y="4">{escape(span.name)}</text>')
+        name = escape(_shortened(span.name, chart.height))
+        parts.append(f'<text class="span" x="{at}" y="4">{name}</text>')
     return "".join(parts)
+
+
+def _shortened(name: str, height: float) -> str:
+    """A vertical name, cut where it would reach beyond a chart of this height, [px]."""
+    columns = 0
+    for k, letter in enumerate(name):
+        columns += 2 if east_asian_width(letter) in "WF" else 1
+        if columns > (height - 8.0) / _COLUMN:
+            return f"{name[: k - 1]}…"
+    return name
 
 
 def _of(chart: Chart) -> str:
@@ -236,7 +263,7 @@ def _polyline(points: Iterable[tuple[float, float]]) -> str:
 
 
 def _names(chart: Chart, low: float, high: float) -> str:
-    """Names at the right ends of lines, spread so that they do not overlap."""
+    """Names at the right ends of lines with a piece of each, spread so that none overlap."""
     if not chart.names_at_ends:
         return ""
     lines = [line for line in chart.lines if line.name and np.isfinite(line.y).any()]
@@ -244,8 +271,8 @@ def _names(chart: Chart, low: float, high: float) -> str:
     ends = [(high - value) / (high - low) for value in last]
     label_ys = spread(ends, 14.0 / chart.height)
     return "".join(
-        f'<text x="100%" dx="6" y="{label_y:.2%}" dy="4" style="fill:var(--{line.role})">'
-        f"{escape(line.name)}</text>"
+        f'<svg x="100%" y="{label_y:.2%}"><path d="M6 0H22" {_stroke(line)}/>'
+        f'<text x="26" dy="4">{escape(line.name)}</text></svg>'
         for line, label_y in zip(lines, label_ys, strict=True)
     )
 
@@ -262,7 +289,7 @@ def _data(chart: Chart, low: float, high: float) -> str:
         "xUnit": chart.x_unit,
         "log": chart.logarithmic,
         "zero": chart.from_zero,
-        "spans": [[s.begin, s.end, s.name] for s in chart.spans],
+        "spans": [[s.begin, s.end, _shortened(s.name, chart.height)] for s in chart.spans],
         "lines": [_line_data(line) for line in chart.lines],
     }
     text = json.dumps(data, separators=(",", ":"), allow_nan=False)
@@ -270,7 +297,7 @@ def _data(chart: Chart, low: float, high: float) -> str:
 
 
 def _line_data(line: ChartLine) -> dict[str, Any]:
-    found: dict[str, Any] = {"name": line.name, "role": line.role, "fits": line.fits}
+    found: dict[str, Any] = {"name": line.name, "stroke": _style(line), "fits": line.fits}
     found |= {"x": _column(line.x), "y": _column(line.y)}
     if line.band is not None:
         found |= {"low": _column(line.band[0]), "high": _column(line.band[1])}

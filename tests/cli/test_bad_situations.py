@@ -475,3 +475,23 @@ def test_an_error_that_the_plans_own_rig_lacks_is_stated_in_the_file_that_is_pas
     with nothing_written(tmp_path):
         answer = call("run", file, "--fast", "--rig", rig, "-o", tmp_path / "run")
     assert "is unknown" not in answer.err
+
+
+@pytest.mark.parametrize("file", ["planner/__init__.py", "drivers.py"])
+def test_a_package_that_the_user_hides_is_not_called_a_defect(tmp_path: Path, file: str) -> None:
+    """As in the shell of another robot's workspace, which sets PYTHONPATH."""
+    hiding = tmp_path / file
+    hiding.parent.mkdir(exist_ok=True)
+    hiding.touch()
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", "from cdpr.cli import main; main()", "run", "plan.json"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    answer = Answer(done.returncode, done.stdout, done.stderr)
+    package = file.partition("/")[0].removesuffix(".py")
+    one_message(answer, 2, f"{hiding}: ", f"hides the package `{package}` of cdpr", "PYTHONPATH")
+    assert "defect" not in answer.said

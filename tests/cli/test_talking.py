@@ -59,6 +59,13 @@ def test_help_lists_every_verb_and_the_exit_codes() -> None:
     assert "3 refused by a safety check" in answer.said
 
 
+def test_the_folder_of_the_documentation_is_shown_letter_for_letter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("cdpr.cli.app.EPILOG", "Documentation: /a [z] [red]/docs")
+    assert "Documentation: /a [z] [red]/docs" in call("--help").said
+
+
 def test_nothing_asked_shows_the_help() -> None:
     answer = call()
     assert answer.code == 2

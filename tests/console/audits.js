@@ -58,7 +58,7 @@
 
   /** Texts that do not fit in their element. */
   cut() {
-    return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value")
+    return this.shown("button, .tiles dt, .tiles dd, .lamps span, #stop-words, #tensions .value, #jog-said, #cable-said")
       .filter((e) => e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1)
       .map(this.nameOf);
   },
@@ -81,7 +81,7 @@
       if (!text || e.closest(exempt)) return [];
       const style = getComputedStyle(e), size = parseFloat(style.fontSize);
       const needed = size >= 24 || (size >= 18.66 && style.fontWeight >= 700) ? 3 : 4.5;
-      const [low, high] = [luminance(parse(style.color)), luminance(behind(e))].sort((a, b) => a - b);
+      const [low, high] = [luminance(parse(e instanceof SVGElement ? style.fill : style.color)), luminance(behind(e))].sort((a, b) => a - b);
       const ratio = (high + 0.05) / (low + 0.05);
       return ratio < needed ? [`${this.nameOf(e)}: ${ratio.toFixed(2)}`] : [];
     });

@@ -7,6 +7,7 @@ import re
 import pytest
 from playwright.sync_api import Browser, expect
 
+from model.pages.charts import series_style
 from tests.console.browsing import ROOT, SIZES, VIEWS, Fake, Visit, visit
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -250,6 +251,36 @@ def test_curves_have_a_gap_where_no_state_arrived(desk: Visit) -> None:
     for curve, value in ((tensions[8], 20), (clearance[1], 80), (following[1], 0.2)):
         assert curve == [value, value, None, value, value]
     assert following[0] == pytest.approx([-29.05, -29.0, -29.0, -0.05, 0.0])
+
+
+def test_the_key_of_the_tensions_shows_the_line_of_each_cable(desk: Visit) -> None:
+    """Cables 1 and 9 had the same key, and lines as those of a report have other dashes."""
+    draw = """async (count) => {
+      const { Curves } = await import("/static/curves.js");
+      const made = [], kept = globalThis.uPlot, curves = new Curves();
+      globalThis.uPlot = class {
+        constructor({ series }) { made.push(series.slice(1)); }
+        setData() {} setSize() {} redraw() {}
+      };
+      curves.take({ tensions_n: Array(count).fill(20), tension_limits_n: [5, 100] }, 1000);
+      curves.show(1000);
+      globalThis.uPlot = kept;
+      const lines = made[0].map((line) => [line.stroke(), line.dash.join()]);
+      const keys = [...document.querySelectorAll("#curve-tensions .key path")].map((path) => {
+        const { stroke, strokeDasharray } = getComputedStyle(path);
+        return [stroke, strokeDasharray.replace(/none|px| /g, "")];
+      });
+      const pixel = document.createElement("canvas").getContext("2d");
+      const hex = (colour) => ((pixel.fillStyle = colour), pixel.fillStyle);
+      return [lines, keys.map(([stroke, dashes]) => [hex(stroke), dashes])];
+    }"""
+    lines, keys = desk.page.evaluate(draw, 24)
+    assert keys == [*lines[:24], lines[-1]], "one key for both limits"
+    assert len({tuple(line) for line in lines}) == 25
+    reported = [series_style(k) for k in range(24)]
+    root = "(name) => getComputedStyle(document.body).getPropertyValue(`--${name}`)"
+    shown = {name: desk.page.evaluate(root, name) for pair in reported for name in pair}
+    assert lines[:24] == [[shown[a], shown[b].replace(" ", ",")] for a, b in reported]
 
 
 def test_the_age_grows_by_the_page_s_own_clock(desk: Visit) -> None:

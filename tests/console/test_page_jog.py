@@ -107,6 +107,21 @@ def test_a_pad_does_not_have_the_focus_again_after_stale_data(desk: Visit) -> No
     assert desk.fake.received("held") == []
 
 
+def test_a_pointer_that_slides_off_its_button_holds_it_until_it_is_lifted(desk: Visit) -> None:
+    """As docs/console.md states it; the button has captured the pointer."""
+    desk.ready_to_jog()
+    number = desk.hold("+z")
+    other = desk.move_to('[data-jog="-x"]')
+    expect(desk.page.locator('[data-jog="+z"]')).to_have_class("held")
+    found = desk.fake.let_pass(desk.page)
+    assert [m["hold"] for m in found["received"] if m["kind"] == "let_go"] == []
+    assert {m["hold"] for m in found["received"] if m["kind"] == "held"} == {number}
+    other.up()
+    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
+    expect(desk.page.locator("#jog-said")).to_have_text("Released")
+    expect(desk.page.locator("[data-jog].held")).to_have_count(0)
+
+
 def test_a_held_jog_ends_for_good(desk: Visit) -> None:
     desk.ready_to_jog()
     end_one_after_another(desk, "+x")
@@ -306,6 +321,21 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             expect(found.page.locator("#jog-limit")).to_contain_text("comes to rest within 17.1 mm")
             expect(found.page.locator("#latched")).to_be_visible()
             assert found.page.locator("#jog-pad").bounding_box() == before, size
+
+
+@pytest.mark.parametrize(("ready", "button"), [("jog", "+z"), ("jog_cables", "wind_in")])
+def test_the_reason_why_a_press_ended_is_shown_whole(phone: Visit, ready: str, button: str) -> None:
+    """It was cut to "End…" beside the state, and a finger opens no tooltip."""
+    getattr(phone, f"ready_to_{ready}")()
+    phone.hold(button)
+    assert phone.audit("cut") == []
+    phone.page.evaluate("() => window.dispatchEvent(new Event('blur'))")
+    phone.page.mouse.up()
+    words = phone.page.locator(f"#{ready.split('_')[-1].removesuffix('s')}-words .heading")
+    expect(words).to_contain_text("Ended: the window lost the focus")
+    expect(words).to_contain_text("Ready: hold a button to move")
+    assert phone.audit("cut") == []
+    assert phone.audit("overlapping") == []
 
 
 def test_random_sequences_hold_only_what_is_pressed(desk: Visit) -> None:

@@ -72,6 +72,20 @@ def test_a_folder_that_the_user_named_is_left_alone(
     assert old.exists()
 
 
+@pytest.mark.parametrize("cache_home", ["cache", ""])
+def test_a_cache_home_that_is_not_absolute_is_ignored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cache_home: str
+) -> None:
+    """As the XDG specification has it; else each working folder would get its own cache."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("XDG_CACHE_HOME", cache_home)
+    assert use_folder("e" * 16) == tmp_path / "home" / ".cache" / "cdpr" / "kernels" / ("e" * 16)
+    assert list((tmp_path / "here").iterdir()) == []
+
+
 @pytest.fixture
 def sources(tmp_path: Path) -> Path:
     """A folder of kernels."""

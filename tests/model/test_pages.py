@@ -142,7 +142,22 @@ def test_colours_are_defined_for_light_and_dark() -> None:
         set(re.findall(r"--([\w-]+):", part))
         for part in style.split("@media screen and (prefers-color-scheme: dark)")
     )
-    assert light == dark - {"of"}
+    assert light - {"dashed", "dotted", "dash-dotted"} == dark - {"of"}
+
+
+def luminance(colour: str) -> float:
+    """As WCAG 2.2 defines it."""
+    parts = np.array([*bytes.fromhex(colour.lstrip("#"))]) / 255.0
+    linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+    return float(linear @ [0.2126, 0.7152, 0.0722])
+
+
+def test_lines_have_the_contrast_that_wcag_asks_for_of_graphics() -> None:
+    for part in resource("base.css").split("prefers-color-scheme: dark"):
+        colours = dict(re.findall(r"--([\w-]+): (#[0-9a-f]{6});", part))
+        for name in (*(f"series{k + 1}" for k in range(8)), "encoder", "tag", "limit", "planned"):
+            low, high = sorted(luminance(colours[one]) for one in (name, "surface"))
+            assert (high + 0.05) / (low + 0.05) >= 3.0, name
 
 
 def test_scripts_are_small_and_ask_for_nothing() -> None:

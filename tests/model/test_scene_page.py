@@ -15,6 +15,7 @@ from playwright.sync_api import Browser, Page, expect
 
 from model.pages.charts import Chart, ChartLine, charts
 from model.pages.page import page as html_page
+from model.pages.page import paragraph, section
 from model.pages.scene import Moment
 from model.pages.viewer import SCENE_SCRIPTS, page_data, viewer
 from tests.console import browsing
@@ -97,6 +98,19 @@ def opened(browser: Browser, path: Path, script: str = COUNTED, **more: Any) -> 
     yield page
     context.close()
     assert wrong == [path.as_uri()]
+
+
+def test_a_hash_in_a_sentence_does_not_widen_the_page_of_a_phone(
+    browser: Browser, tmp_path: Path
+) -> None:
+    """As in the pages of workspace maps: of rig and scene, 64 digits each."""
+    path, words = tmp_path / "page.html", f"Rig six, hash {'0123456789abcdef' * 4}; no scene."
+    body = section("about", "About", paragraph(words), f"<ul><li>{words}</li></ul>")
+    path.write_text(html_page("Maps", body, lead=words))
+    page = browser.new_page(viewport={"width": 390, "height": 800})
+    page.goto(path.as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    page.close()
 
 
 @pytest.mark.parametrize("points", [101, 400_000])

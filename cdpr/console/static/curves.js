@@ -4,17 +4,19 @@ import { STALE_S } from "./connection.js";
 import { at, known, make, write } from "./elements.js";
 
 const SECONDS = 60, REDRAW_MS = 250, HEIGHT = 140, SERIES = 8;
-const colour = (role) => getComputedStyle(document.documentElement).getPropertyValue(`--${role}`).trim();
+const DASHES = ["", "dashed", "dash-dotted"]; // of each eight cables, as `series_style` of charts.py
+const variable = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 
-/** Options of one plot: its lines are `{label, role, dash, limit}`; a limit does not set the range. */
+/** Options of one plot: its lines are `{label, role, dash, limit}`, colour and dashes by their names in base.css; a limit
+ * does not set the range. */
 function options(lines, { x, zero = false, least = 0 }) {
-  const axis = (more) => ({ stroke: () => colour("muted"), grid: { stroke: () => colour("grid"), width: 1 }, ticks: { show: false }, values: (_, all) => all.map((v) => String(v).replace("-", "\u2212")), font: "11px system-ui, sans-serif", ...more });
+  const axis = (more) => ({ stroke: () => variable("muted"), grid: { stroke: () => variable("grid"), width: 1 }, ticks: { show: false }, values: (_, all) => all.map((v) => String(v).replace("-", "\u2212")), font: "11px system-ui, sans-serif", ...more });
   return {
     width: 300, height: HEIGHT, legend: { show: false }, cursor: { drag: { x: false, y: false } }, padding: [8, 10, 0, 0],
     scales: { x: { time: false, range: x }, y: { range: (_, low, high) => range(low, Math.max(high, least), zero) } },
     axes: [axis({ size: 20, gap: 4, label: "Time [s]", labelSize: 16, labelGap: 0, labelFont: "11px system-ui, sans-serif" }), axis({ size: 42, gap: 4 })],
     series: [{}, ...lines.map(({ label, role, dash, limit }) => ({
-      label, stroke: () => colour(role), width: 1.5, dash, auto: !limit, points: { show: false }, spanGaps: false,
+      label, stroke: () => variable(role), width: 1.5, dash: dash ? variable(dash).split(" ").map(Number) : [], auto: !limit, points: { show: false }, spanGaps: false,
     }))],
   };
 }
@@ -26,10 +28,20 @@ function range(low, high, zero) {
 }
 
 const tensionLines = (count) => [
-  ...Array.from({ length: count }, (_, k) => ({ label: `cable ${k + 1}`, role: `series${(k % SERIES) + 1}`, dash: k >= SERIES ? [5, 3] : undefined })),
-  { label: "limit", role: "limit", dash: [6, 4], limit: true }, { label: "limit", role: "limit", dash: [6, 4], limit: true },
+  ...Array.from({ length: count }, (_, k) => ({ label: `cable ${k + 1}`, role: `series${(k % SERIES) + 1}`, dash: DASHES[Math.floor(k / SERIES) % DASHES.length] })),
+  ...Array(2).fill({ label: "limit", role: "limit", dash: "dotted", limit: true }),
 ];
-const CLEARANCE = [{ label: "clearance", role: "encoder" }, { label: "required", role: "limit", dash: [6, 4] }];
+const CLEARANCE = [{ label: "clearance", role: "encoder" }, { label: "required", role: "limit", dash: "dotted" }];
+
+/** A short piece of a line, as in the plot. */
+function sample({ role, dash }) {
+  const [svg, path] = ["svg", "path"].map((tag) => document.createElementNS("http://www.w3.org/2000/svg", tag));
+  path.setAttribute("d", "M0 5H16");
+  path.style.strokeDasharray = dash ? `var(--${dash})` : "none";
+  svg.setAttribute("class", `role-${role}`);
+  svg.append(path);
+  return svg;
+}
 
 /** A plot that fills the width of its figure. */
 class Plot {
@@ -44,7 +56,7 @@ class Plot {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#plot.redraw());
     const key = figure.querySelector(".keys");
     const shown = lines.length > 1 ? lines.filter((line, k) => lines.findIndex((other) => other.label === line.label) === k) : [];
-    key.replaceChildren(...shown.map(({ label, role }) => make("span", { class: "key" }, make("span", { class: `swatch role-${role}` }), label.replace("cable ", ""))));
+    key.replaceChildren(...shown.map((line) => make("span", { class: "key" }, sample(line), line.label.replace("cable ", ""))));
   }
 
   draw(data) {
