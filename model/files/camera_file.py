@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic.config import JsonDict
 
 from model.files.documents import (
     WHOLE_LARGEST,
@@ -17,6 +19,7 @@ from model.files.documents import (
     Number,
     PoseDocument,
     Positive,
+    in_schema,
 )
 from model.tag_families import TagFamily, tags_in
 
@@ -31,6 +34,8 @@ FISHEYE = "fisheye"
 LENSES = ("pinhole", FISHEYE)
 """OpenCV's camera models, by the key `lens`."""
 LensName = Literal["pinhole", "fisheye"]
+COEFFICIENTS = {LENSES[0]: (0, 4, 5, 8, 12, 14), FISHEYE: (4,)}
+"""Numbers of distortion coefficients that a lens model may have."""
 
 
 def require_coefficients(lens: str, count: int) -> None:
@@ -39,11 +44,15 @@ def require_coefficients(lens: str, count: int) -> None:
     Raises:
         ValueError: The number does not fit the lens model.
     """
-    known = (4,) if lens == FISHEYE else (0, 4, 5, 8, 12, 14)
-    if count not in known:
-        *most, last = map(str, known)
+    if count not in COEFFICIENTS[lens]:
+        *most, last = map(str, COEFFICIENTS[lens])
         listed = f"{', '.join(most)} or {last}" if most else last
         raise ValueError(f"a {lens} lens needs {listed} coefficients, it has {count}")
+
+
+def _counted(counts: Sequence[int]) -> JsonDict:
+    """JSON schema of a list that has one of these numbers of entries."""
+    return {"anyOf": [{"minItems": count, "maxItems": count} for count in counts]}
 
 
 # Covariances of a calibrated camera.
@@ -72,13 +81,24 @@ def _has_six_rows(rows: list[list[float]]) -> list[list[float]]:
     return rows
 
 
+_six = in_schema(minItems=6, maxItems=6)
+_four_or_more = in_schema(minItems=4)
+
 PoseCovariance = Annotated[
-    list[list[AnyNumber]], AfterValidator(lambda rows: _is_covariance(rows, 6))
+    list[Annotated[list[AnyNumber], _six]],
+    AfterValidator(lambda rows: _is_covariance(rows, 6)),
+    _six,
 ]
 """Of a pose: position [mm] and rotation about the outer frame's axes [deg], 6 x 6."""
-LensCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance_of_numbers)]
+LensCovariance = Annotated[
+    list[Annotated[list[AnyNumber], _four_or_more]],
+    AfterValidator(_is_covariance_of_numbers),
+    _four_or_more,
+]
 """Of a camera's n numbers in rig file order: fx, fy, cx, cy [px] and distortion, n x n."""
-PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
+PoseSlopes = Annotated[
+    list[Annotated[list[AnyNumber], _four_or_more]], AfterValidator(_has_six_rows), _six
+]
 """Derivatives of a pose by a camera's n numbers: position [mm] and rotation [deg], 6 x n."""
 
 
@@ -127,7 +147,18 @@ class TagsDocument(Document):
 class CameraDocument(Document):
     """One camera: intrinsics (OpenCV) and pose (x right, y down, z along the view)."""
 
-    name: Name
+    model_config = ConfigDict(
+        json_schema_extra={
+            "if": {"properties": {"lens": {"const": FISHEYE}}, "required": ["lens"]},
+            "then": {
+                "properties": {"distortion": _counted(COEFFICIENTS[FISHEYE])},
+                "required": ["distortion"],
+            },
+            "else": {"properties": {"distortion": _counted(COEFFICIENTS["pinhole"])}},
+        }
+    )
+
+    name: Annotated[Name, in_schema(pattern="^[^/=.][^/=]*$")]
     width_px: Pixels
     height_px: Pixels
     fx_px: Positive
