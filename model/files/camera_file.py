@@ -71,10 +71,6 @@ def _is_covariance(rows: list[list[float]], count: int) -> list[list[float]]:
     return rows
 
 
-def _is_covariance_of_numbers(rows: list[list[float]]) -> list[list[float]]:
-    return _is_covariance(rows, len(rows))
-
-
 def _has_six_rows(rows: list[list[float]]) -> list[list[float]]:
     if len(rows) != 6 or len({len(row) for row in rows}) != 1:
         raise ValueError("needs 6 rows, each with one number per lens number of the camera")
@@ -90,10 +86,9 @@ PoseCovariance = Annotated[
     _six,
 ]
 """Of a pose: position [mm] and rotation about the outer frame's axes [deg], 6 x 6."""
+LensMatrix = Annotated[list[Annotated[list[AnyNumber], _four_or_more]], _four_or_more]
 LensCovariance = Annotated[
-    list[Annotated[list[AnyNumber], _four_or_more]],
-    AfterValidator(_is_covariance_of_numbers),
-    _four_or_more,
+    LensMatrix, AfterValidator(lambda rows: _is_covariance(rows, max(4, len(rows))))
 ]
 """Of a camera's n numbers in rig file order: fx, fy, cx, cy [px] and distortion, n x n."""
 PoseSlopes = Annotated[
@@ -172,7 +167,7 @@ class CameraDocument(Document):
         validate_default=True,
     )
     world_from_camera: PoseDocument
-    lens_covariance: LensCovariance | None = Field(
+    lens_covariance: LensMatrix | None = Field(
         default=None,
         description="of fx_px, fy_px, cx_px, cy_px and distortion; calibrations write it",
     )
@@ -216,7 +211,11 @@ class CameraDocument(Document):
     def _one_a_number(
         cls, rows: list[list[float]] | None, info: ValidationInfo
     ) -> list[list[float]] | None:
-        count = 4 + len(info.data.get("distortion", []))
-        if rows is not None and len(rows[0]) != count:
+        if rows is None or "distortion" not in info.data:  # a wrong one has no number to compare
+            return rows
+        count = 4 + len(info.data["distortion"])
+        if info.field_name == "lens_covariance":
+            return _is_covariance(rows, count)
+        if len(rows[0]) != count:
             raise ValueError(f"needs {count} numbers per row: fx, fy, cx, cy and distortion")
         return rows
