@@ -314,7 +314,7 @@ def check_version(
         InvalidFile: With that one problem.
     """
     field, key = model.model_fields.get("schema_version"), "schema_version"
-    version = data.get(key)
+    version = _whole(data.get(key))
     if field is None or not isinstance(version, int):
         return
     (known,) = field.annotation.__args__  # type: ignore[union-attr]
