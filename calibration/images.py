@@ -286,7 +286,7 @@ def open_timed_images(source: Path, camera: Camera, rate: float | None) -> Image
         rate: Frame rate of a folder, [Hz]; the camera's when left out.
 
     Returns:
-        The images; their names are times in seconds since the first, such as ``0.100 s a.png``.
+        The images, named by seconds since the first, such as ``0.100000 s a.png``.
 
     Raises:
         BadInput: It is neither, or its images are of another size.
