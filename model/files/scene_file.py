@@ -96,13 +96,13 @@ class StopDocument(PoseDocument):
 
     model_config = ConfigDict(
         json_schema_extra={
-            "if": {"properties": {"kind": {"enum": ["pick", "place"]}}, "required": ["kind"]},
+            "if": {"properties": {"kind": {"const": "pass"}}},
             "then": {
-                "properties": {"dwell_s": {"exclusiveMinimum": 0}, "mass_kg": {"type": "number"}},
-                "required": ["dwell_s", "mass_kg"],
+                "properties": {"mass_kg": {"type": "null"}, "mass_centre_mm": {"type": "null"}}
             },
             "else": {
-                "properties": {"mass_kg": {"type": "null"}, "mass_centre_mm": {"type": "null"}}
+                "properties": {"dwell_s": {"exclusiveMinimum": 0}, "mass_kg": {"type": "number"}},
+                "required": ["dwell_s", "mass_kg"],
             },
         }
     )
