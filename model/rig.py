@@ -160,7 +160,7 @@ class Rig(ReadOnly):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Rig:
-        """The rig of a rig file's keys and values; arrays are taken for lists.
+        """The rig of a rig file's keys and values; lists may be given as arrays.
 
         Raises:
             InvalidFile: With every key that does not fit.
