@@ -9,14 +9,7 @@ from os import PathLike
 from pathlib import Path
 
 from calibration.extrinsics.hand_eye import locate_by_motion
-from calibration.extrinsics.result import (
-    ExtrinsicCalibration,
-    ExtrinsicsResult,
-    extrinsics_facts,
-    extrinsics_page,
-    extrinsics_result,
-    judge_extrinsics,
-)
+from calibration.extrinsics.result import ExtrinsicsOutcome, judged_extrinsics
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.geometry.calibrate import RigCalibration, fit_rig
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, checked_deviations
@@ -84,7 +77,6 @@ from model.rig import Camera, Rig
 from model.scene import require_unaltered
 
 CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
-ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
 TagsOutcome = Calibration[TagsResult, TagLayout, CalibrationVerdict]
 ReadoutOutcome = Calibration[ReadoutResult, ReadoutCalibration, CalibrationVerdict]
 RigOutcome = Calibration[RigResult, RigCalibration, RigQuality]
@@ -231,11 +223,7 @@ def locate_camera(
         found = locate_by_frame_tags(rig, taken_by, observations, survey or Survey(0.5e-3, None))
     else:
         found = locate_by_motion(rig, taken_by, observations, known)
-    verdict = judge_extrinsics(found, wanted)
-    result = extrinsics_result(found, verdict, rig.document, to.on)
-    page = extrinsics_page(found, result, verdict, taken_by.world_from_camera)
-    facts = extrinsics_facts(found, taken_by.world_from_camera)
-    return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
+    return judged_extrinsics(found, rig, taken_by, wanted, to)
 
 
 def locate_tags(

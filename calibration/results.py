@@ -291,31 +291,6 @@ class Calibration(Generic[Result, Found, Quality]):
     files: tuple[Path, ...] = ()
 
     @property
-    def order(self) -> int:
-        """Its rank among applied results, as `Rig.with_calibration` needs it."""
-        return self.result.order
-
-    @property
-    def follows(self) -> str:
-        """Name of the result of its kind that is applied before, if given; empty for none."""
-        return self.result.follows
-
-    @property
-    def kind(self) -> str:
-        """Kind of calibration, such as ``camera``."""
-        return self.result.kind
-
-    @property
-    def name(self) -> str:
-        """Name of what was calibrated."""
-        return self.result.name
-
-    @property
-    def date(self) -> str:
-        """Date, ISO 8601."""
-        return self.result.date
-
-    @property
     def verdict(self) -> str:
         """What it is good for, in a sentence."""
         return self.result.verdict
@@ -325,22 +300,15 @@ class Calibration(Generic[Result, Found, Quality]):
         """Whether its verdict is good."""
         return self.result.good_enough
 
-    def corrected(self, rig: RigDocument) -> RigDocument:
-        """The rig file's content with this result applied.
-
-        Raises:
-            BadInput: The result is not about this rig.
-        """
-        return self.result.corrected(rig)
-
     def __repr__(self) -> str:
         """Kind, name, date and verdict."""
-        return f"<Calibration {self.kind} {self.name}, {self.date}: {self.verdict}>"
+        about = self.result
+        return f"<Calibration {about.kind} {about.name}, {about.date}: {about.verdict}>"
 
     def _repr_html_(self) -> str:
         """Table of results for notebooks."""
-        rows = [*self.result.in_words(), ("verdict", self.result.verdict)]
-        return html_table(f"Calibration {self.kind} {self.name}", rows)
+        rows = [*self.result.in_words(), ("verdict", self.verdict)]
+        return html_table(f"Calibration {self.result.kind} {self.result.name}", rows)
 
     def saved_in(self, folder: Path | None) -> Self:
         """Writes result and report into a folder, if any; returns the calibration with their paths.

@@ -16,7 +16,6 @@ from drivers.can_bus import (
     transmit,
 )
 from drivers.can_errors import (
-    SETTING_UP,
     BusFault,
     EchoFilter,
     ErrorFrames,
@@ -27,6 +26,7 @@ from drivers.can_errors import (
 from drivers.can_load import check_bus_load
 from drivers.drive_group import WHOLE_BUS, CycleStatus, GroupState, Pump
 from drivers.plausibility import largest_steps
+from drivers.setup_refusals import SETTING_UP
 from model.errors import Refused
 from model.rig import Rig
 

@@ -14,7 +14,7 @@ import numpy as np
 from can import BusABC
 
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
-from drivers.can_errors import TorqueLost, before_motion
+from drivers.can_errors import before_motion
 from drivers.drive_group import DriveSnapshot, how_to_reset
 from drivers.factory import (
     blocked_in_fault,
@@ -25,6 +25,7 @@ from drivers.factory import (
     stop_alone,
     time_to_stop_alone,
 )
+from drivers.setup_refusals import TorqueLost
 from executor.control.preconditions import configuration_at_rest, require_below, with_counts_at
 from executor.control.standstill import is_braked
 from executor.interlock.fault_latch import FaultLatch, LatchedFault

@@ -34,14 +34,13 @@ from model.errors import (
 )
 from model.files.plan_file import PlanDocument
 from model.files.scene_file import RotationLimitsDocument
-from model.jit import KernelSet, compilation
 from model.pages.page import FactsDisplay
 from model.plan import plan_from_document
 from model.pose import Array, Pose, largest_rotations, point_of
 from model.progress import SILENT, Listener
 from model.rig import Rig, rig_from_document
 from model.scene import Scene, empty_scene, require_unaltered, scene_from_document
-from planner.kernels.jit import KERNELS
+from planner.kernels.jit import planner_compilation
 from planner.planning import make_plan
 from planner.settings import OptimalSettings, TurningSettings, whole_number
 
@@ -169,9 +168,8 @@ def plan_straight_move(
     settings = TurningSettings if turns else OptimalSettings
     if turns:
         moving_scene = _free_to_turn(moving_scene, (start, goal))
-    task = KernelSet("turning" if turns else "optimal", KERNELS)
     with (
-        compilation(task, "the planner", "one to three minutes", listener) as compiled,
+        planner_compilation("turning" if turns else "optimal", listener) as compiled,
         listener.waiting("planning") if compiled else nullcontext(),
     ):
         document = make_plan(rig, moving_scene, settings(seed=0, rounds=1))

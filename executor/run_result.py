@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from numpy.typing import NDArray
 
 from drivers.can_bus import IN_PROCESS
+from executor.interlock.fault_latch import AFTER_A_FAULT
 from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
@@ -108,10 +109,7 @@ class RunResult:
         if self.summary.get("interface") == IN_PROCESS:
             return "find the cause, then run again into a new folder"
         if not {event["code"] for event in self.summary["events"]}.isdisjoint(_RELEASES):
-            return (
-                "find the cause and check the platform; `cdpr status RIG` shows whether to run"
-                " `cdpr release RIG` or to press the emergency stop before `cdpr reset RIG`"
-            )
+            return AFTER_A_FAULT
         return "find the cause and check the platform, then run `cdpr reset RIG`"
 
     def missing_text(self) -> str:

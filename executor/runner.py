@@ -38,9 +38,10 @@ from executor.proposals import Proposal, motion_proposal, require_confirmed
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_name
-from executor.recording.recorder import Recorder, require_readable_record
+from executor.recording.recorder import Recorder
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
 from executor.recording.summary import versions
+from executor.recording.tables import require_readable_record
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult, folder_maker

@@ -19,6 +19,7 @@ from executor.control.winch_motion import (
 )
 from executor.drives import abandoned_drives_fault, is_simulated, unreferenced_drives_of
 from executor.hold_to_run.presses import PressBoard
+from executor.interlock.fault_latch import AFTER_A_FAULT
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_to_simulate
 from executor.realtime.child import MotionTask, ReadyDrives
@@ -147,7 +148,7 @@ def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) ->
         next_step = "find the cause, then begin again: the simulated drives ended with the motion"
         if not is_simulated(rig):
             why += "; `cdpr status RIG` shows which hold"
-            next_step = "find the cause and check the platform, then run `cdpr reset RIG`"
+            next_step = AFTER_A_FAULT
         raise Fault(result.cause, where="winches", why=why, next_step=next_step)
     return result
 

@@ -182,7 +182,7 @@ def _scaled(rows: list[list[float]] | None, scales: Array) -> Array | None:
 
 @runtime_checkable
 class CalibrationResult(Protocol):
-    """A result of `calibration`, as `Rig.with_calibration` accepts it."""
+    """A result of `calibration`, which `Rig.with_calibration` applies."""
 
     @property
     def order(self) -> int:
@@ -221,6 +221,16 @@ class CalibrationResult(Protocol):
 
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with this result applied."""
+
+
+@runtime_checkable
+class FinishedCalibration(Protocol):
+    """A calibration with its fit and its report, of which the result is applied."""
+
+    @property
+    def result(self) -> CalibrationResult:
+        """As written to the file."""
+        ...
 
 
 Result = TypeVar("Result", bound=CalibrationResult)

@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from model.cameras import CalibrationResult, Camera, Tag, camera_from, corrected, tag_from
+from model.cameras import (
+    CalibrationResult,
+    Camera,
+    FinishedCalibration,
+    Tag,
+    camera_from,
+    corrected,
+    tag_from,
+)
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, load_yaml, millimetres
 from model.files.reading import docs_page
@@ -316,7 +324,9 @@ class Rig(ReadOnly):
         bus = document_of(dict(self.document.bus) | given, BusDocument, "Rig.with_bus")
         return rig_from_document(self.document.model_copy(update={"bus": bus}))
 
-    def with_calibration(self, *results: CalibrationResult, listener: Listener = SILENT) -> Rig:
+    def with_calibration(
+        self, *results: CalibrationResult | FinishedCalibration, listener: Listener = SILENT
+    ) -> Rig:
         """The rig with its file's numbers replaced by calibration results, in memory only.
 
         Args:
@@ -329,8 +339,9 @@ class Rig(ReadOnly):
                 an altered copy (`model.scene.require_unaltered`).
         """
         require_unaltered(self)
-        require_types(*((one, CalibrationResult) for one in results), (listener, Listener))
-        return rig_from_document(corrected(self.document, results, listener))
+        given = [one.result if isinstance(one, FinishedCalibration) else one for one in results]
+        require_types(*((one, CalibrationResult) for one in given), (listener, Listener))
+        return rig_from_document(corrected(self.document, given, listener))
 
     def plot(self, pose: Pose | None = None, scene: Scene | None = None) -> Figure:
         """A figure of the rig at a pose (home when left out), among a scene's obstacles."""

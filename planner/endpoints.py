@@ -21,8 +21,7 @@ from model.statics.tension_distribution import TensionInfeasible, remedy
 from model.statics.wrench_sets import rms_anchor_radius
 from planner.check import GENTLER, NEAR_AXIS, least_axis_distance
 from planner.check_report import CheckReport
-from planner.costs import capacity_margins, external_wrenches, margin_reserve
-from planner.path import LENGTH_ROUND_OFF
+from planner.costs import LENGTH_ROUND_OFF, capacity_margins, external_wrenches, margin_reserve
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE
 
 SAME_ROTATION = 1e-7

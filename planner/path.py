@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -66,84 +65,6 @@ def smallest_gap(first: Array, second: Array) -> float:
         second: Positions, shape (j, 3), [m].
     """
     return min(float(np.linalg.norm(second - node, axis=-1).min()) for node in first)
-
-
-# The best path within a length limit: a price λ of length is raised until the limit is kept.
-#
-# With the objective plus λ times the length, a higher λ gives a shorter path. Every few rounds λ is
-# raised where the best path is too long, else lowered, by steps halved towards the smallest λ that
-# keeps the limit; the best path within the limit is kept. A path not yet polished may mislead, so
-# steps grow again where λ has to move in one direction for long.
-
-
-LENGTH_ROUND_OFF = 1e-9
-"""Tolerance of a longest path, [m]: one of exactly the straight distance is a path."""
-_ROUNDS = 6
-"""Between changes of λ."""
-_FIRST, _LEAST, _MOST = 2.0**-2, 2.0**-10, 64.0
-"""The first and the smallest λ above 0, in costs of a metre by the objective; and the λ at which
-practically only the length counts, for weights of scale 1."""
-_FINEST, _COARSEST = 2.0**-5, 2.0
-"""Steps of λ, in powers of 2."""
-_PERSISTENT, _GROWTH = 4, 1.5
-"""Steps in one direction from which they grow, and by how much: halved steps nearly reach the λ at
-which the direction changed, but not past it."""
-
-
-class LengthLimit:
-    """The search for λ, updated after every round.
-
-    Attributes:
-        price: λ, cost of a metre on top of the objective.
-        path: The best path found that is short enough, shape (k, n); None without one.
-    """
-
-    def __init__(self, longest: float, unit: float) -> None:
-        """Begins without a price of length.
-
-        Args:
-            longest: Longest path allowed, [m].
-            unit: Typical cost of a metre by the objective.
-        """
-        self.price = 0.0
-        self.path: Array | None = None
-        self._longest, self._unit = longest, unit
-        self._step, self._repeated, self._was_short = _COARSEST, _PERSISTENT - 1, False
-        self._rounds = 0
-        self._least = math.inf
-
-    def after_round(self, path: Array, length: float, cost: Callable[[], float]) -> bool:
-        """Records the best path at this price; changes the price every few rounds.
-
-        Args:
-            path: Best path of the round, shape (k, n).
-            length: Its length, [m].
-            cost: Computes its cost by the objective alone.
-
-        Returns:
-            Whether the price has changed.
-        """
-        short_enough = length <= self._longest + LENGTH_ROUND_OFF
-        if short_enough:
-            self._keep(path, cost())
-        self._rounds += 1
-        return self._rounds % _ROUNDS == 0 and self._moved(short_enough)
-
-    def _keep(self, path: Array, cost: float) -> None:
-        if cost < self._least:
-            self._least, self.path = cost, path
-
-    def _moved(self, short_enough: bool) -> bool:
-        self._repeated = self._repeated + 1 if short_enough == self._was_short else 1
-        self._was_short = short_enough
-        factor = _GROWTH if self._repeated >= _PERSISTENT else 0.5
-        self._step = min(max(factor * self._step, _FINEST), _COARSEST)
-        if self.price == 0.0:
-            self.price = 0.0 if short_enough else min(_FIRST * self._unit, _MOST)
-            return not short_enough  # else the objective alone keeps the limit
-        wanted = self.price * 2.0 ** (-self._step if short_enough else self._step)
-        self.price = min(max(wanted, _LEAST * self._unit), _MOST)
-        return True
 
 
 # A sequence of poses as one curve, parametrised by a bound on the motion of any platform point.

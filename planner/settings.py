@@ -11,7 +11,7 @@ from typing import Any, Literal
 from model.errors import BadInput, NoSolution, distinct_figures, is_masked, real_number
 from model.files.documents import LARGEST, SEED_LARGEST, WHOLE_LARGEST
 from planner.path import Progress
-from planner.rrt.variants import DEFAULT, AlgorithmVariant, ConeDraw, FailureRate, Focus, Steer
+from planner.rrt.variants import DEFAULT, AlgorithmVariant
 
 SamplerName = Literal["adaptive", "goal-bias"]
 CostName = Literal["kinematic", "length"]
@@ -283,12 +283,8 @@ Objective = Literal["length", "kinematic", "clearance", "capacity"]
 """Named objectives."""
 
 _OPTIMAL = ("weight", "budget_ms", "rounds", "longest_mm", "free_rotation")
-_PAPER = ("mode", "max_iterations", "steer", "spacing_mm", "goal_sight")
-_OPTIONS = {
-    "optimal": _OPTIMAL,
-    "adaptive": (*_PAPER, "failure_rate", "focus", "cone_draw"),
-    "goal-bias": _PAPER,
-}
+_PAPER = ("mode", "max_iterations")
+_OPTIONS = {"optimal": _OPTIMAL, "adaptive": _PAPER, "goal-bias": _PAPER}
 _ARGUMENTS = {"weight": "weights", "budget_ms": "budget", "longest_mm": "longest"}
 """Arguments of `cdpr.plan` with another name than the option."""
 
@@ -308,12 +304,6 @@ class PlanningOptions:
         free_rotation: Optimal: the platform may rotate, within the scene's limits.
         mode: The paper's planners: RRT* (rewire), or stop at the first path (paper).
         max_iterations: The paper's planners: give up after this number of samples.
-        failure_rate: See `AlgorithmVariant`, as for all below.
-        focus: The node x_c.
-        cone_draw: How points of the forward cone are drawn.
-        steer: How far a new node is from its parent.
-        spacing_mm: New nodes nearer than this to another are rejected.
-        goal_sight: Every new node tries the goal.
     """
 
     planner: PlannerName = "optimal"
@@ -326,12 +316,6 @@ class PlanningOptions:
     free_rotation: bool = False
     mode: Mode | None = None
     max_iterations: int | None = None
-    failure_rate: FailureRate | None = None
-    focus: Focus | None = None
-    cone_draw: ConeDraw | None = None
-    steer: Steer | None = None
-    spacing_mm: float | None = None
-    goal_sight: bool = False
 
 
 def settings_from_options(options: PlanningOptions) -> Settings:
@@ -361,19 +345,13 @@ def settings_from_options(options: PlanningOptions) -> Settings:
 
 
 def _refuse_unused(options: PlanningOptions) -> None:
-    own = _OPTIONS[options.planner]
-    known = {name for names in _OPTIONS.values() for name in names}
-    unused = [name for name in sorted(known - set(own)) if _is_given(getattr(options, name))]
+    others = {*_OPTIMAL, *_PAPER} - {*_OPTIONS[options.planner]}
+    unused = [name for name in sorted(others) if _is_given(getattr(options, name))]
     if unused:
         named = ", ".join(f"`{_ARGUMENTS.get(name, name)}=`" for name in unused)
         raise BadInput(
             f"`planner={options.planner!r}` does not take {named}",
             next_step="leave it out, or choose another planner",
-        )
-    if options.steer is not None and options.mode != "paper":
-        raise BadInput(
-            "`steer=` applies only to `mode='paper'`; RRT* steps never pass the sample",
-            next_step="pass `mode='paper'` as well, or leave out `steer=`",
         )
 
 
@@ -434,17 +412,5 @@ def _paper_settings(options: PlanningOptions) -> PlannerSettings:
         cost="length" if cost == "length" else "kinematic",
         mode="rewire" if options.mode is None else options.mode,
         seed=options.seed,
-        readings=_readings(options),
         **given,
     )
-
-
-def _readings(options: PlanningOptions) -> AlgorithmVariant:
-    """The text's readings, except for those that options change."""
-    given: dict[str, Any] = {
-        name: choice
-        for name in ("failure_rate", "focus", "cone_draw", "steer")
-        if (choice := getattr(options, name)) is not None
-    }
-    spacing = (options.spacing_mm or 0.0) / 1000.0
-    return AlgorithmVariant(**given, spacing=spacing, goal_sight=options.goal_sight)

@@ -1,4 +1,4 @@
-"""A simulated rig with the interfaces of a real one: drives, platform, cameras, faults."""
+"""A simulated rig with the interfaces of a real one: drives, platform, cameras."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from model.lazy import lazy_names
 if TYPE_CHECKING:
     from simulation.camera.camera import SyntheticCamera
     from simulation.factory import make_rehearsal, make_synthetic_camera
-    from simulation.fault_bus import FaultBus
     from simulation.ground_truth import rig_as_built
     from simulation.plant import Plant
     from simulation.rig import SimulatedRig
 
 __all__ = [
-    "FaultBus",
     "Plant",
     "SimulatedRig",
     "SyntheticCamera",
@@ -30,7 +28,6 @@ if not TYPE_CHECKING:
         {
             "simulation.camera.camera": "SyntheticCamera",
             "simulation.factory": "make_rehearsal make_synthetic_camera",
-            "simulation.fault_bus": "FaultBus",
             "simulation.ground_truth": "rig_as_built",
             "simulation.plant": "Plant",
             "simulation.rig": "SimulatedRig",

@@ -139,7 +139,6 @@ class Tracker:
             )
         self.rig, self.camera = rig, camera
         self.settings = settings or TrackerSettings()
-        self.camera_check: CameraCheck | None = None
         self._detector = make_detector(rig.tag_detector, rig.tag_family)
         self._frame = {tag.id: tag for tag in rig.frame_tags}
         self._recent = RecentMotion(camera.readout)
@@ -287,7 +286,6 @@ class Tracker:
                 values=moved.values,
             ) from None
         if check is not None:
-            self.camera_check = check
             self._failed = (self._pictures, check) if check.error > self._moved_px else None
 
     def _suspicion(self, failed: CameraCheck) -> str:

@@ -18,10 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from calibration.extrinsics.result import (
     ExtrinsicCalibration,
-    extrinsics_facts,
-    extrinsics_page,
-    extrinsics_result,
-    judge_extrinsics,
+    ExtrinsicsOutcome,
+    judged_extrinsics,
     scaled_to,
     widths_of,
     workspace_corners,
@@ -34,8 +32,7 @@ from calibration.images import (
     same_images,
 )
 from calibration.intrinsics.calibrate import NOT_FOUND
-from calibration.procedures import ExtrinsicsOutcome
-from calibration.results import Calibration, Destination, Issue, data_hash
+from calibration.results import Destination, Issue, data_hash
 from calibration.statistics import duplicate_reason, has_not_moved
 from calibration.tag_map.bundle_adjustment import require_tags
 from calibration.tag_map.observations import (
@@ -407,11 +404,7 @@ def locate_camera_by_another(
         for body in pair
     )
     found = locate_by_pairs(rig, camera, reference, pairs, unused, data_hash(numbers))
-    verdict = judge_extrinsics(found, wanted)
-    result = extrinsics_result(found, verdict, rig.document, to.on)
-    page = extrinsics_page(found, result, verdict, camera.world_from_camera)
-    facts = extrinsics_facts(found, camera.world_from_camera)
-    return Calibration(result, page, found, verdict, facts).saved_in(to.folder)
+    return judged_extrinsics(found, rig, camera, wanted, to)
 
 
 def _require_recorded(cameras: Sequence[Camera], opened: Sequence[ImageSet]) -> None:

@@ -13,7 +13,14 @@ from pydantic import Field
 
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, page_of, table_of
-from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
+from calibration.results import (
+    Calibration,
+    CalibrationVerdict,
+    Destination,
+    Issue,
+    ResultDocument,
+    common_keys,
+)
 from calibration.statistics import Interval, rms_bound, student_factor
 from model.cameras import Z_95
 from model.files.camera_file import PoseCovariance, PoseSlopes
@@ -349,6 +356,28 @@ def extrinsics_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[st
         *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
         *moved_rows(before, found.world_from_camera),
     ]
+
+
+ExtrinsicsOutcome = Calibration[ExtrinsicsResult, ExtrinsicCalibration, CalibrationVerdict]
+
+
+def judged_extrinsics(
+    found: ExtrinsicCalibration, rig: Rig, camera: Camera, wanted: float, to: Destination
+) -> ExtrinsicsOutcome:
+    """A finished calibration of a camera's pose, written to a folder where one is given.
+
+    Args:
+        found: The fit.
+        rig: The robot.
+        camera: As in the rig file.
+        wanted: Required error in the work space, 95 %, [m].
+        to: Where to write it.
+    """
+    verdict, before = judge_extrinsics(found, wanted), camera.world_from_camera
+    result = extrinsics_result(found, verdict, rig.document, to.on)
+    page = extrinsics_page(found, result, verdict, before)
+    made = Calibration(result, page, found, verdict, extrinsics_facts(found, before))
+    return made.saved_in(to.folder)
 
 
 def moved_rows(before: Pose, after: Pose) -> list[tuple[str, str]]:

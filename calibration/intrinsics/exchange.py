@@ -172,20 +172,6 @@ FORMATS: dict[FormatName, Callable[[CameraDocument], str]] = {
 """Writers of camera files, by the name of the format."""
 
 
-def imported_camera(path: Path, camera: CameraDocument, entry: str | None = None) -> CameraDocument:
-    """A camera with the parameters of a file in one of `FORMATS`, detected by content.
-
-    Args:
-        path: The file.
-        camera: Gives name, pose and rate.
-        entry: Which camera of a Kalibr camchain, such as ``cam1``; the only one when left out.
-
-    Raises:
-        BadInput: The file cannot be read, has an unknown format, or values out of range.
-    """
-    return _with_lens(camera, _found(path, entry), path)
-
-
 def _with_lens(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> CameraDocument:
     errors = ("lens_covariance", "pose_by_lens", "pose_covariance", "error_mm")
     kept = {k: v for k, v in camera.model_dump(mode="json").items() if k not in errors}
@@ -263,9 +249,17 @@ def write_rig_with_camera(
 
     What is assumed and what remains to be done is reported to the listener and in the file.
 
+    Args:
+        output: The file to write.
+        rig: The robot.
+        name: Of the camera, which keeps its pose and rate.
+        path: A file in one of `FORMATS`, detected by content.
+        entry: Which camera of a Kalibr camchain, such as ``cam1``; the only one when left out.
+        listener: Receives the remarks.
+
     Raises:
-        BadInput: As in `imported_camera`, the rig has no such camera, or ``output`` exists or
-            cannot be written.
+        BadInput: The file cannot be read, has an unknown format, or values out of range; the rig
+            has no such camera; or ``output`` exists or cannot be written.
     """
     if output.exists():
         raise BadInput(

@@ -33,7 +33,6 @@ from model.pose import Pose
 from model.rig import load_rig
 from model.scene import load_scene
 from planner.planning import plan_path
-from planner.rrt.variants import ConeDraw, FailureRate, Focus, Steer
 from planner.settings import (
     OBJECTIVES,
     Mode,
@@ -43,8 +42,6 @@ from planner.settings import (
     least_rounds,
     settings_from_options,
 )
-
-_READING: dict[str, Any] = {"rich_help_panel": "Open readings of the paper's text (docs/paper.md)"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,14 +69,6 @@ class SearchOptions:
     max_iterations: int | None = option(
         "the paper's planners: largest number of samples", min=1, max=1_000_000
     )
-    failure_rate: FailureRate | None = option("e_r, k: failures in a row", **_READING)
-    focus: Focus | None = option("the node x_c", **_READING)
-    cone_draw: ConeDraw | None = option("r and θ₁ uniform, or points uniform in volume", **_READING)
-    steer: Steer | None = option("steps of --mode paper: as Eq. 9, or as RRT*", **_READING)
-    spacing_mm: float | None = option(
-        "reject nodes closer than this to another", min=0.0, **_READING
-    )
-    goal_sight: bool = flag("every new node tries the goal", **_READING)
 
     def with_seed(self, seed: int) -> PlanningOptions:
         """As options of the planner's library."""

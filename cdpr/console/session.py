@@ -47,15 +47,10 @@ from cdpr.console.state import (
 )
 from cdpr.console.teach import TaughtPoses, picked_pose, scene_text
 from cdpr.console.verbs import ConsoleFiles, StartedVerb, busy_state, outcome_state
-from cdpr.console.view import (
-    LoadedPlan,
-    RobotView,
-    nearest_data,
-    plan_id,
-    pose_data,
-)
+from cdpr.console.view import LoadedPlan, RobotView, nearest_data, plan_id, pose_data
 from cdpr.console.watch import CameraImages, RobotWatch, RunWatch
 from executor.drives import is_simulated
+from executor.hold_to_run.presses import press_clock
 from executor.remote.client import stop_runs
 from executor.remote.command_socket import is_stopped_since
 from executor.remote.status import bus_name
@@ -83,7 +78,7 @@ class Console:
         """
         self.files, self.rig = files, files.rig
         self.scene = load_scene(files.scene_file) if files.scene_file else None
-        self.control = PageControl(lambda: time.time_ns() // 1_000_000)
+        self.control = PageControl(press_clock)
         self.verbs = StartedVerb([files.rig_file, *map(Path, files.calibration_options[1::2])])
         self.watch = RunWatch(self.rig)
         self.view = RobotView(files.rig, self.scene)

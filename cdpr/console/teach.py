@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError
 
 from model.errors import BadInput, InvalidFile, Refused
 from model.files.documents import Document, Name, PoseDocument, millimetres, write_atomic
@@ -29,17 +29,32 @@ NEAR = 0.5e-3
 AGAIN = "restore the file, or move it away to start without poses"
 
 
+def _trimmed(name: object) -> object:
+    return name.strip() if isinstance(name, str) else name
+
+
+TaughtName = Annotated[Name, BeforeValidator(_trimmed)]
+
+
 class TaughtPose(PoseDocument):
     """A named pose."""
 
-    name: Name
+    name: TaughtName
+
+
+def _named_once(poses: list[TaughtPose]) -> list[TaughtPose]:
+    names = [pose.name for pose in poses]
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            raise ValueError(f"pose name {name!r} appears twice")
+    return poses
 
 
 class TaughtDocument(Document):
     """The file of taught poses."""
 
     schema_version: Literal[1] = 1
-    poses: list[TaughtPose] = Field(default_factory=list)
+    poses: Annotated[list[TaughtPose], AfterValidator(_named_once)] = Field(default_factory=list)
 
 
 class TaughtPoses:
@@ -78,9 +93,9 @@ class TaughtPoses:
         self._poses = self._read()
         if len(self._poses) >= MOST:
             raise _refusal(f"there are {MOST} poses already", "remove one that is not needed")
-        self._require_free(name)
-        document = PoseDocument.of(pose)
-        self._keep([*self._poses, _named(document, name)])
+        named = _named(PoseDocument.of(pose), name)
+        self._require_free(named.name)
+        self._keep([*self._poses, named])
 
     def rename(self, pose: str, name: str) -> None:
         """Renames a pose.
@@ -90,11 +105,10 @@ class TaughtPoses:
         """
         self._poses = self._read()
         index = self._index(pose)
-        if name != pose:
-            self._require_free(name)
-        changed = list(self._poses)
-        changed[index] = _named(changed[index], name)
-        self._keep(changed)
+        named = _named(self._poses[index], name)
+        if named.name != self._poses[index].name:
+            self._require_free(named.name)
+        self._keep([*self._poses[:index], named, *self._poses[index + 1 :]])
 
     def move(self, pose: str, to: int) -> None:
         """Moves a pose to another position in the order, from 0.
@@ -246,7 +260,7 @@ def scene_text(document: SceneDocument) -> str:
 
 def _named(pose: PoseDocument, name: str) -> TaughtPose:
     try:
-        checked = TypeAdapter(Name).validate_python(name.strip())
+        checked = TypeAdapter(TaughtName).validate_python(name)
     except ValidationError as error:
         reason = sentence_of(error.errors()[0], TaughtPose)
         raise _refusal(

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 
 import can
 
-from drivers.can_errors import DriveRestarted, Refusals, TorqueLost, answers_twice
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.expected_objects import (
     HOW_SCALED,
@@ -51,6 +50,7 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import HOLDS
 from drivers.drive_group import OnRestarted, Pump
 from drivers.plausibility import require_within_limits
+from drivers.setup_refusals import DriveRestarted, Refusals, TorqueLost, answers_twice
 from model.errors import Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig

@@ -6,7 +6,6 @@ import struct
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from drivers.can_errors import SETTING_UP, in_fault, moved_by_another, wrong_setting
 from drivers.cia402.error_codes import emergency_text, stored_error
 from drivers.cia402.object_dictionary import HEARTBEAT_CONSUMERS, SOFTWARE_LIMITS, Setting
 from drivers.cia402.pdo import NmtCommand
@@ -20,6 +19,7 @@ from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, 
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState
 from drivers.plausibility import WrongScale, wrong_scales
+from drivers.setup_refusals import SETTING_UP, in_fault, moved_by_another, wrong_setting
 from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import ProfileDocument, object_key, object_name
 from model.files.rig_file import Cia402Document

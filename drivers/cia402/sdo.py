@@ -18,13 +18,7 @@ from math import ceil
 import can
 
 from drivers.can_bus import SentFrame, echoes_own_frames, receive_frame, transmit
-from drivers.can_errors import (
-    SETTING_UP,
-    DriveRestarted,
-    EchoFilter,
-    ForeignMaster,
-    error_frame_fault,
-)
+from drivers.can_errors import EchoFilter, ForeignMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
     EMCY_BASE,
@@ -42,6 +36,7 @@ from drivers.cia402.pdo import (
 )
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import Pump
+from drivers.setup_refusals import SETTING_UP, DriveRestarted
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
 RESPONSE_TIMEOUT = 2.0

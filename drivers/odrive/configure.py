@@ -9,23 +9,8 @@ from pathlib import Path
 
 import can
 
-from drivers.can_bus import (
-    SentFrame,
-    echoes_own_frames,
-    receive_frame,
-    transmit,
-)
-from drivers.can_errors import (
-    SETTING_UP,
-    EchoFilter,
-    ForeignMaster,
-    answers_twice,
-    bus_text,
-    error_frame_fault,
-    in_fault,
-    moved_by_another,
-    wrong_setting,
-)
+from drivers.can_bus import SentFrame, echoes_own_frames, receive_frame, transmit
+from drivers.can_errors import EchoFilter, ForeignMaster, bus_text, error_frame_fault
 from drivers.can_load import heartbeat_within
 from drivers.drive_group import Pump
 from drivers.odrive.endpoints import Endpoint, Endpoints, Wanted, read_endpoints, wanted_settings
@@ -45,6 +30,13 @@ from drivers.odrive.messages import (
     node_and_command,
 )
 from drivers.plausibility import position_limits
+from drivers.setup_refusals import (
+    SETTING_UP,
+    answers_twice,
+    in_fault,
+    moved_by_another,
+    wrong_setting,
+)
 from model.errors import BadInput, HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig

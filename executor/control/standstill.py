@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from drivers.drive_group import CycleStatus, GroupCommand, GroupState
 from executor.control.preconditions import require_capabilities
 from executor.control.sync_master import ReplyTimeout, SyncMaster, changed_states, late_fault
-from executor.interlock.fault_latch import LatchedFault
+from executor.interlock.fault_latch import AFTER_A_FAULT, LatchedFault
 from executor.interlock.interlock import MotionInterlock
 from executor.realtime.child import Armed, Ended, MotionTask, ReadyDrives
 from executor.realtime.process import RealTimeProcess
@@ -86,7 +86,7 @@ class Standstill(ABC):
                     otherwise,
                     where=self.where,
                     why="a drive treats loss of its master as a fault, or lost power",
-                    next_step="check the platform and the drives, then run `cdpr reset RIG`",
+                    next_step=AFTER_A_FAULT,
                 )
         except CdprError as error:
             self.cause, self.error = error.what, error
@@ -216,8 +216,7 @@ def _not_released(what: str) -> Fault:
         what,
         where="release",
         why="a drive did not follow the release sequence; those under torque hold",
-        next_step="check the drives, then run `cdpr reset RIG`; if none can be released, cut the"
-        " motor power by the emergency stop once the platform is supported",
+        next_step=AFTER_A_FAULT,
     )
 
 

@@ -19,6 +19,7 @@ from drivers.drive_group import CycleStatus
 from drivers.factory import may_have_released, without_torque
 from executor.control.cycle import SETTLING
 from executor.control.winch_loop import WinchMover
+from executor.interlock.fault_latch import AFTER_A_FAULT
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.realtime.child import Armed, Ended, Records
@@ -92,7 +93,7 @@ def require_held(rig: Rig, result: WinchResult, found: CycleStatus) -> None:
         what,
         where="winches",
         why="a drive released, slipped or was moved by hand; counts and pose do not match",
-        next_step="check the platform and the drives, then run `cdpr reset RIG`",
+        next_step=AFTER_A_FAULT,
     )
 
 

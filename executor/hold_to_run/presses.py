@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 import threading
+import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +23,15 @@ TIMEOUT = 0.150
 
 _ENTRY, _CHECK = struct.Struct("<QdB?B?d"), struct.Struct("<I")
 _SIZE = _ENTRY.size + _CHECK.size
+
+
+def press_clock() -> int:
+    """Time since the boot, [ms]: the source of press numbers.
+
+    All programs of this computer share it, and unlike the wall clock it is never set back: the
+    numbers of another console would be over until it had caught up.
+    """
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) // 1_000_000
 
 
 class PressRule:

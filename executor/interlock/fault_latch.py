@@ -37,6 +37,12 @@ from model.files.documents import write_atomic
 #: Readers of the lock release it within this time, [s].
 LOCK_TIMEOUT = 0.5
 
+#: Next step after a fault. A drive in fault is not reset while others hold the platform.
+AFTER_A_FAULT = (
+    "find the cause and check the platform; `cdpr status RIG` shows whether to run"
+    " `cdpr release RIG` or to press the emergency stop before `cdpr reset RIG`"
+)
+
 _UNKNOWN = "unknown"
 #: In the lock after the process ID.
 _DURING_FAULT = " during a latched fault"
@@ -343,8 +349,7 @@ class FaultLatch:
             f"a fault is latched since {latched.since}: {latched.cause}",
             where=f"bus {self._bus}",
             why=f"on record in {latched.folder}",
-            next_step="find the cause and check the platform, then run `cdpr reset RIG`;"
-            " nothing was moved",
+            next_step=f"{AFTER_A_FAULT}; nothing was moved",
         )
 
     def _not_kept(self, why: str | None) -> Refused:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,8 +20,7 @@ from executor.remote.status import RunStatus
 from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
 from executor.trajectory.dwell import legs_at, stop_events
 from executor.trajectory.setpoints import CheckedTrajectory, PreparedRun
-from model.errors import BadInput, CdprError, Fault
-from model.files.reading import MEGABYTE, READING_NEEDS, TABLE_LIMIT
+from model.errors import CdprError, Fault
 from model.kinematics import forward_kinematics, interpolate_quaternions, poses_near
 from model.pose import Array, Pose
 from model.rig import Rig
@@ -33,31 +33,6 @@ _CHUNK = 4096
 _STATES = tuple(State)
 
 Cycles = NDArray[np.void]
-
-#: Size of a row of ``cycles.csv`` in a run of hours: of all cables together, and of each, [bytes].
-ROW, ROW_PER_CABLE = 230, 45
-
-
-def require_readable_record(prepared: PreparedRun) -> None:
-    """Refuses a run whose ``cycles.csv`` would be too large for this computer to read.
-
-    A run that is paused or slowed down takes longer, and may still exceed the limit.
-
-    Raises:
-        BadInput: With its size, and the longest run.
-    """
-    row = ROW + ROW_PER_CABLE * prepared.rig.cable_count
-    size = row * len(prepared.checked.table)
-    if size <= TABLE_LIMIT:
-        return
-    longest = TABLE_LIMIT / row * prepared.checked.table.cycle
-    raise BadInput(
-        f"the record of a run of {prepared.duration / 60.0:.0f} minutes would have"
-        f" {size / MEGABYTE:.0f} MB; at most {TABLE_LIMIT / MEGABYTE:.0f} MB are read",
-        where="cycles.csv of the run",
-        why=f"reading it takes {READING_NEEDS} times its size in memory",
-        next_step=f"split the plan into runs of at most {longest / 60.0:.0f} minutes",
-    )
 
 
 class RunLog:
@@ -229,6 +204,13 @@ BEHIND = 5.0
 _MOST_WAITING = 512
 
 
+class _Mark(NamedTuple):
+    """How far the cycles are queued or written; replaced whole, as two threads read it."""
+
+    end: int
+    at: float
+
+
 class RecordWriter:
     """Writer of one run's record; its thread, if any, ends with the block.
 
@@ -240,8 +222,7 @@ class RecordWriter:
 
     def __init__(self, folder: RunFolder, log: RunLog, *, own_thread: bool) -> None:
         self._folder, self._log, self._own_thread = folder, log, own_thread
-        self._queued, self._written = 0, 0
-        self._queued_until, self._written_until = 0.0, 0.0
+        self._queued = self._written = _Mark(0, 0.0)
         self._trouble: CdprError | None = None
         self._waiting: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -263,9 +244,9 @@ class RecordWriter:
         Raises:
             CdprError: The record cannot be written, or the disk is far behind.
         """
-        if not self._queued:
-            self._queued_until = self._written_until = at
-        if at - self._queued_until >= EVERY or not self._queued:
+        if not self._queued.end:
+            self._queued = self._written = _Mark(0, at)
+        if at - self._queued.at >= EVERY or not self._queued.end:
             self._queue_cycles(at)
 
     def take_event(self, event: RunEvent) -> None:
@@ -285,7 +266,7 @@ class RecordWriter:
             CdprError: The function raised it, and no thread writes.
         """
         with suppress(CdprError):
-            self._queue_cycles(self._queued_until)
+            self._queue_cycles(self._queued.at)
         if self._thread is None:
             write()
         else:
@@ -294,7 +275,7 @@ class RecordWriter:
     def close(self) -> None:
         """Writes the rest, and waits for it; never raises."""
         try:
-            self._queue_cycles(self._queued_until)
+            self._queue_cycles(self._queued.at)
         except CdprError as error:
             self._trouble = self._trouble or error
         if self._thread is not None:
@@ -303,19 +284,33 @@ class RecordWriter:
             self._thread = None
 
     def _queue_cycles(self, at: float) -> None:
-        first, end = self._queued, len(self._log)
-        if end == first:
+        first, mark = self._queued.end, _Mark(len(self._log), at)
+        if mark.end == first:
             return
-        self._queued, self._queued_until = end, at
-        self._put(partial(self._append, first, end, at))
+        self._queued = mark
+        self._put(partial(self._append, first, mark))
 
-    def _append(self, first: int, end: int, at: float) -> None:
-        if first != self._written:  # earlier cycles could not be written: leave no gap
+    def _append(self, first: int, mark: _Mark) -> None:
+        """Appends the cycles up to a mark, and in the same write those that were queued since.
+
+        Otherwise a disk that takes longer than `EVERY` for any write would fall behind for ever.
+        """
+        if first != self._written.end:  # written already, or not to be written: leave no gap
             return
-        table = self._log.table(first, end)
+        newest = self._queued
+        try:
+            self._append_up_to(newest)
+        except Fault:
+            if newest == mark:
+                raise
+            self._append_up_to(mark)  # a disk without room for all may have room for these
+
+    def _append_up_to(self, mark: _Mark) -> None:
+        first = self._written.end
+        table = self._log.table(first, mark.end)
         header = table.csv_header() if first == 0 else ""
         self._folder.append_cycles(header + table.csv_rows(), fsync=self._own_thread)
-        self._written, self._written_until = end, at
+        self._written = mark
 
     def _put(self, write: Callable[[], None]) -> None:
         if self._trouble is not None:
@@ -323,7 +318,7 @@ class RecordWriter:
         if self._thread is None:
             write()
             return
-        behind = self._queued_until - self._written_until
+        behind = self._queued.at - self._written.at
         if behind > BEHIND or self._waiting.qsize() >= _MOST_WAITING:
             self._trouble = Fault(
                 f"the disk is {behind:.1f} s behind the run; the limit is {BEHIND:g} s",

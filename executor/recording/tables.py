@@ -6,7 +6,7 @@ A new column of ``cycles.csv`` is a field of `CycleTable`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -21,9 +21,14 @@ from executor.recording.table_files import (
     texts,
 )
 from executor.state_machine import ON_PATH, State
+from model.errors import BadInput
+from model.files.reading import MEGABYTE, READING_NEEDS, TABLE_LIMIT
 from model.pose import Array, Pose, quaternion_from_matrix
 from tracking.fusion import Measured, fuse_with_encoders
 from tracking.pose_log import COVARIANCE, POSITION, ROTATION, SCALES, STD
+
+if TYPE_CHECKING:
+    from executor.trajectory.setpoints import PreparedRun  # loads the planner's check
 
 _MM, _MS = 1e3, 1e3
 _ON_PATH = [state.value for state in ON_PATH]
@@ -143,6 +148,32 @@ class CycleTable(Table):
         """Distance of the encoders' position from the planned one, shape (n,), [m]."""
         error: Array = np.linalg.norm(self.encoder - self.planned, axis=1)
         return error
+
+
+#: Size of a row of ``cycles.csv`` in a run of hours: of all cables together, and of each, [bytes].
+ROW, ROW_PER_CABLE = 230, 45
+
+
+def require_readable_record(prepared: PreparedRun) -> None:
+    """Refuses a run whose ``cycles.csv`` would be too large for this computer to read.
+
+    A run that is paused or slowed down takes longer, and may still exceed the limit.
+
+    Raises:
+        BadInput: With its size, and the longest run.
+    """
+    row = ROW + ROW_PER_CABLE * prepared.rig.cable_count
+    size = row * len(prepared.checked.table)
+    if size <= TABLE_LIMIT:
+        return
+    longest = TABLE_LIMIT / row * prepared.checked.table.cycle
+    raise BadInput(
+        f"the record of a run of {prepared.duration / 60.0:.0f} minutes would have"
+        f" {size / MEGABYTE:.0f} MB; at most {TABLE_LIMIT / MEGABYTE:.0f} MB are read",
+        where="cycles.csv of the run",
+        why=f"reading it takes {READING_NEEDS} times its size in memory",
+        next_step=f"split the plan into runs of at most {longest / 60.0:.0f} minutes",
+    )
 
 
 def quaternions_of(rotations: Array) -> Array:

@@ -13,10 +13,10 @@ from model.pose import Array
 
 
 class CsvTable:
-    """Named columns of text and numbers.
+    """Named columns of text and numbers; lines and names that a spreadsheet left empty are ignored.
 
     Attributes:
-        names: Of the columns, in order.
+        names: Of the columns, in order; several may be empty.
     """
 
     def __init__(self, path: Path) -> None:
@@ -28,15 +28,17 @@ class CsvTable:
         """
         self._path = path
         file = CsvFile(path)
-        self.names = tuple(name.strip() for name in file.rows[0]) if file.rows else ()
-        self._rows, self._lines = file.rows[1:], file.lines[1:]
+        filled = [k for k, row in enumerate(file.rows) if any(text.strip() for text in row)]
+        rows, lines = [file.rows[k] for k in filled], [file.lines[k] for k in filled]
+        self.names = tuple(name.strip() for name in rows[0]) if rows else ()
+        self._rows, self._lines = rows[1:], lines[1:]
         if not self._rows:
             raise self.bad("the file holds no values", "write a header line, then lines of values")
         for separator, name in ((";", "semicolons"), ("\t", "tabs")):
             if len(self.names) == 1 and separator in self.names[0]:
                 what = f"values are separated by {name}"
                 raise self.bad(what, "separate them by commas, and decimals by a point")
-        twice = {name for name in self.names if self.names.count(name) > 1}
+        twice = {name for name in self.names if name and self.names.count(name) > 1}
         if twice:
             raise self.bad(f"the column {min(twice)!r} appears twice", "name each column once")
         for number, row in zip(self._lines, self._rows, strict=True):
@@ -58,7 +60,8 @@ class CsvTable:
         if missing:
             several = f"columns {', '.join(missing)} are" if len(missing) > 1 else None
             what = f"the {several or f'column {missing[0]} is'} missing"
-            raise self.bad(what, f"name it in the first line, which has: {', '.join(self.names)}")
+            present = ", ".join(filter(None, self.names))
+            raise self.bad(what, f"name it in the first line, which has: {present}")
 
     def of(self, names: Sequence[str]) -> Array:
         """Columns of finite numbers side by side, shape (n, len(names)).

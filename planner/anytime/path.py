@@ -36,10 +36,10 @@ from planner.anytime.problem import (
     set_weights,
 )
 from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
-from planner.costs import KinematicCost
+from planner.costs import KinematicCost, LengthLimit
 from planner.kernels.jit import kernel, leaf
 from planner.kernels.primitives import uniform
-from planner.path import LengthLimit, Progress, Route
+from planner.path import Progress, Route
 from planner.settings import OptimalSettings, least_rounds
 from planner.wrench.translation import edge_held
 

@@ -23,9 +23,9 @@ from planner.anytime_6d.connect import connect
 from planner.anytime_6d.local_search import Line, copied, line_length, measure, new_line, polish
 from planner.anytime_6d.problem import RotatingProblem, build_objective, move_length, set_weights
 from planner.collision.world import build_robot, build_world
-from planner.costs import KinematicCost, margin_reserve
+from planner.costs import KinematicCost, LengthLimit, margin_reserve
 from planner.edge_checks import REASONS
-from planner.path import LengthLimit, Progress, Route, smallest_gap
+from planner.path import Progress, Route, smallest_gap
 from planner.settings import (
     CLEARANCE_RESERVE,
     TurningSettings,

@@ -7,14 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from calibration.intrinsics.exchange import (
-    imported_camera,
-    write_rig_with_camera,
-)
+from calibration.intrinsics.exchange import write_rig_with_camera
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument
 from model.progress import Listener
 from model.rig import Rig, load_rig
+from tests.calibration.imports import imported_camera
 from tracking.clearance import require_stated_errors
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -144,7 +142,7 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
     text, lens, coefficients = FOREIGN[name]
     file = tmp_path / "camera"
     file.write_text(text)
-    found = imported_camera(file, rig.document.cameras[0])
+    found = imported_camera(file, rig)
     assert numbers_of(found) == (lens, (752, 480), FOCAL, coefficients)
     remarks = Remarks([])
     write_rig_with_camera(tmp_path / "rig.yaml", rig, rig.cameras[0].name, file, listener=remarks)
@@ -188,7 +186,7 @@ def test_the_message_names_the_key_and_what_is_expected(rig, tmp_path, text, why
     file = tmp_path / "camera"
     file.write_text(text)
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, rig.document.cameras[0])
+        imported_camera(file, rig)
     assert why in str(caught.value.why)
 
 

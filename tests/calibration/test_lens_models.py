@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
 from calibration.intrinsics.calibrate import CameraCalibration, calibrate_from_views
-from calibration.intrinsics.exchange import FORMATS, imported_camera, write_rig_with_camera
+from calibration.intrinsics.exchange import FORMATS, write_rig_with_camera
 from calibration.intrinsics.lens import LENSES, RADIAL, LensFit, error_of, fit_lens, radial_share
 from calibration.intrinsics.quality import (
     _slopes,
@@ -25,14 +25,16 @@ from calibration.intrinsics.quality import (
     image_grid,
     judge_camera,
 )
+from calibration.intrinsics.result import with_camera
 from calibration.targets.boards import Chessboard, DetectedBoard
 from model.cameras import camera_from
 from model.errors import BadInput
 from model.files.camera_file import CameraDocument
 from model.pose import Pose, matrix_from_rotation_vector, read_only
-from model.rig import Camera, Rig, load_rig
+from model.rig import Camera, Rig, load_rig, rig_from_document
 from model.scene import load_scene
 from simulation.camera.camera import SyntheticCamera
+from tests.calibration.imports import imported_camera
 from tests.cli.program import call, one_message
 from tracking.camera_model import (
     WIDEST,
@@ -393,14 +395,13 @@ def test_a_camera_comes_back_from_the_files_of_others(rig, tmp_path, form, name)
     file = tmp_path / "camera.yaml"
     file.write_text(FORMATS[form](own))
     plain = rig.document.cameras[0]
-    sure = plain.model_copy(
-        update={
-            "lens_covariance": np.eye(4 + len(plain.distortion)).tolist(),
-            "pose_by_lens": np.zeros((6, 4 + len(plain.distortion))).tolist(),
-        }
-    )
-    assert imported_camera(file, sure) == imported_camera(file, plain), "files state no errors"
-    back = imported_camera(file, plain)
+    errors = {
+        "lens_covariance": np.eye(4 + len(plain.distortion)).tolist(),
+        "pose_by_lens": np.zeros((6, 4 + len(plain.distortion))).tolist(),
+    }
+    sure = rig_from_document(with_camera(rig.document, plain.model_copy(update=errors)))
+    assert imported_camera(file, sure) == imported_camera(file, rig), "files state no errors"
+    back = imported_camera(file, rig)
     assert back.lens == own.lens
     assert back.distortion == pytest.approx(own.distortion, abs=1e-15)
     assert (back.fx_px, back.cx_px, back.width_px) == (own.fx_px, 651.3, own.width_px)
@@ -428,19 +429,19 @@ cam1:
 
 
 def test_a_camera_of_a_kalibr_chain_is_read_by_its_entry(rig, tmp_path) -> None:
-    file, plain = tmp_path / "camchain.yaml", rig.document.cameras[0]
+    file = tmp_path / "camchain.yaml"
     file.write_text(KALIBR)
-    first, second = (imported_camera(file, plain, entry) for entry in ("cam0", "cam1"))
+    first, second = (imported_camera(file, rig, entry) for entry in ("cam0", "cam1"))
     assert (first.lens, second.lens) == ("pinhole", "fisheye")
     assert first.distortion == [-0.27695497, 0.06712482, 0.00087538, 0.00011556]
     assert (first.fx_px, first.fy_px, first.cx_px, first.cy_px) == (
         461.629, 460.152, 362.680, 246.049)  # fmt: skip
     assert (second.width_px, second.height_px) == (512, 512)
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, plain)
+        imported_camera(file, rig)
     assert "cam0, cam1; choose one with --entry" in str(caught.value.why)
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, plain, "cam7")
+        imported_camera(file, rig, "cam7")
     assert "not 'cam7'" in str(caught.value.why)
 
 
@@ -466,7 +467,7 @@ WHOLE = MESSAGE.replace("height: 0, width: 0", "height: 720, width: 1280")
 def test_a_message_of_ros_as_it_is_printed_can_be_read(rig, tmp_path, text: str) -> None:
     file = tmp_path / "message.yaml"
     file.write_text(text)
-    found = imported_camera(file, rig.document.cameras[0])
+    found = imported_camera(file, rig)
     assert (found.width_px, found.height_px, found.fx_px, found.cy_px) == (1280, 720, 900.0, 359.5)
     assert found.distortion == [-0.36, 0.11, 0.001, 0.0005, 0.0]
 
@@ -484,7 +485,7 @@ def test_a_message_of_ros_for_a_part_of_the_pixels_is_refused(rig, tmp_path, old
     file = tmp_path / "message.yaml"
     file.write_text(MESSAGE.replace(old, new, 1))
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, rig.document.cameras[0])
+        imported_camera(file, rig)
     assert "binned, or a part" in str(caught.value.why)
 
 
@@ -492,21 +493,21 @@ def test_kalibr_models_that_rig_files_lack_are_named(rig, tmp_path) -> None:
     file = tmp_path / "camchain.yaml"
     file.write_text(KALIBR.replace("camera_model: pinhole", "camera_model: ds", 1))
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, rig.document.cameras[0], "cam0")
+        imported_camera(file, rig, "cam0")
     assert "cam0 is ds-radtan" in str(caught.value.why)
 
 
 def test_the_models_named_for_kalibr_are_those_that_are_read(rig, tmp_path) -> None:
     """Its option is `pinhole-equi`, its files say `equidistant`."""
-    file, plain = tmp_path / "camchain.yaml", rig.document.cameras[0]
+    file = tmp_path / "camchain.yaml"
     text = KALIBR.replace("distortion_model: radtan", "distortion_model: MODEL", 1)
     file.write_text(text.replace("MODEL", "equi"))
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, plain, "cam0")
+        imported_camera(file, rig, "cam0")
     why = str(caught.value.why)
     assert why == "cam0 is pinhole-equi; pinhole with radtan, equidistant, none can be read"
     file.write_text(text.replace("MODEL", "equidistant"))
-    assert imported_camera(file, plain, "cam0").lens == "fisheye"
+    assert imported_camera(file, rig, "cam0").lens == "fisheye"
 
 
 MRCAL = """# generated on 2024-01-01 with mrcal-calibrate-cameras
@@ -527,9 +528,9 @@ MRCAL = """# generated on 2024-01-01 with mrcal-calibrate-cameras
 
 
 def test_a_camera_of_mrcal_is_read_and_a_splined_one_refused(rig, tmp_path) -> None:
-    file, plain = tmp_path / "camera-0.cameramodel", rig.document.cameras[0]
+    file = tmp_path / "camera-0.cameramodel"
     file.write_text(MRCAL)
-    found = imported_camera(file, plain)
+    found = imported_camera(file, rig)
     assert found.distortion == [0.1, 0.2, 0.003, 0.004, 0.5, 0.6, 0.7, 0.8]
     assert (found.fx_px, found.cy_px, found.width_px, found.height_px) == (
         1761.1,
@@ -539,7 +540,7 @@ def test_a_camera_of_mrcal_is_read_and_a_splined_one_refused(rig, tmp_path) -> N
     )
     file.write_text(MRCAL.replace("LENSMODEL_OPENCV8", "LENSMODEL_SPLINED_STEREOGRAPHIC_order=3"))
     with pytest.raises(BadInput) as caught:
-        imported_camera(file, plain)
+        imported_camera(file, rig)
     assert "mrcal-convert-lensmodel" in str(caught.value.why)
 
 
@@ -587,7 +588,7 @@ def test_opencvs_xml_gives_the_same_camera_as_its_yaml(rig, tmp_path) -> None:
     for name in ("camera_matrix", "distortion_coefficients"):
         xml.write(name, given.getNode(name).mat())
     xml.release()
-    found = imported_camera(file, rig.document.cameras[0])
+    found = imported_camera(file, rig)
     assert found == own.model_copy(update={"error_mm": None})
 
 
@@ -596,11 +597,11 @@ def test_a_damaged_file_of_opencv_does_not_end_the_program(rig, tmp_path) -> Non
     text = FORMATS["opencv"](with_lens(rig, "pinhole", [0.01] * 4))
     file = tmp_path / "camera.yml"
     file.write_text(text.replace("   cols: 1\n", ""))
-    assert imported_camera(file, rig.document.cameras[0]).distortion == [0.01] * 4
+    assert imported_camera(file, rig).distortion == [0.01] * 4
     for number in (".nan", "1e400", "9" * 399, "[", "!!opencv-matrix"):
         file.write_text(text.replace("image_width: 1280", f"image_width: {number}"))
         with pytest.raises(BadInput):
-            imported_camera(file, rig.document.cameras[0])
+            imported_camera(file, rig)
 
 
 @pytest.mark.parametrize(
@@ -626,7 +627,7 @@ def test_files_that_hold_no_camera_are_refused_in_one_message(rig, tmp_path, tex
     file = tmp_path / "camera.yaml"
     file.write_text(text)
     with pytest.raises(BadInput):
-        imported_camera(file, rig.document.cameras[0])
+        imported_camera(file, rig)
 
 
 def test_a_rig_file_with_an_imported_lens_is_written_and_never_replaced(rig, tmp_path) -> None:
@@ -648,21 +649,24 @@ def test_a_camera_of_opencvs_xml_is_read(rig, tmp_path) -> None:
     storage.write("camera_matrix", matrix_of(500.0))
     storage.write("distortion_coefficients", np.array([[0.1, 0.2, 0.0, 0.0, 0.3]]))
     storage.release()
-    found = imported_camera(file, rig.document.cameras[0])
+    found = imported_camera(file, rig)
     assert (found.fx_px, found.cx_px, found.width_px) == (500.0, 470.0, 640)
     assert found.distortion == [0.1, 0.2, 0.0, 0.0, 0.3]
 
 
-def test_a_damaged_opencv_file_ends_in_a_message_not_in_a_dead_program(rig, tmp_path) -> None:
+def test_a_damaged_opencv_file_is_read_or_refused_and_never_ends_the_program(rig, tmp_path) -> None:
     """OpenCV's own reader writes past the end of a matrix with fewer rows than numbers."""
-    whole = FORMATS["opencv"](with_lens(rig, "pinhole", [0.1, 0.2, 0.0, 0.0, 0.3]))
-    file = tmp_path / "camera.yml"
-    for old, new in (("rows: 3", "rows: 99999"), ("dt: d", "dt: 9x"), ("1280", "9" * 400)):
+    own = with_lens(rig, "pinhole", [0.1, 0.2, 0.0, 0.0, 0.3])
+    whole, file = FORMATS["opencv"](own), tmp_path / "camera.yml"
+    for old, new in (("rows: 3", "rows: 99999"), ("dt: d", "dt: 9x")):  # not used
+        assert old in whole
         file.write_text(whole.replace(old, new))
-        try:
-            imported_camera(file, rig.document.cameras[0])
-        except BadInput:
-            continue
+        found = imported_camera(file, rig)
+        assert found == own.model_copy(update={"error_mm": None})
+    assert "image_width: 1280\n" in whole
+    file.write_text(whole.replace("1280", "9" * 400))
+    with pytest.raises(BadInput, match="image_width is not a number of pixels"):
+        imported_camera(file, rig)
 
 
 def test_ros_has_no_thin_prism(rig) -> None:

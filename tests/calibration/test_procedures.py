@@ -53,7 +53,7 @@ def test_a_folder_becomes_a_result_file_and_a_report(folder: Path, tmp_path: Pat
         "calibration_camera_front_2026-03-01.html",
     ]
     assert load_result(made.files[0]) == made.result.sealed()
-    assert made.quality.verdict.good == made.result.good_enough
+    assert made.quality.verdict.good == made.good_enough
 
 
 def test_pictures_need_no_folder_and_nothing_is_written_unless_asked(folder: Path) -> None:

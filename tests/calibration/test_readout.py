@@ -67,7 +67,8 @@ def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: P
     assert len(found.speeds) == 22
     assert found.after < 0.7 * found.before
     assert made.quality.good
-    assert made.corrected(rig.document).cameras[0].readout_ms == pytest.approx(found.readout * 1e3)
+    camera = rig.with_calibration(made).document.cameras[0]
+    assert camera.readout_ms == pytest.approx(found.readout * 1e3)
 
 
 def test_a_camera_that_exposes_all_rows_at_once_has_none(rig: Rig, tmp_path: Path) -> None:

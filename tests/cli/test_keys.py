@@ -7,6 +7,7 @@ import os
 import pty
 import sys
 import termios
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from itertools import pairwise
@@ -175,7 +176,7 @@ def test_a_key_that_waited_while_the_program_paused_begins_no_press(
 ) -> None:
     """It may have been released meanwhile: a terminal does not tell."""
     clock, held = [0.0], Mock()
-    monkeypatch.setattr(jog, "time", SimpleNamespace(monotonic=lambda: clock[0], time_ns=lambda: 0))
+    monkeypatch.setattr(jog, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     record: Any = SimpleNamespace(state=State.MOVING, at=0.0)
     prover: Any = SimpleNamespace(pose=Pose.level([0.0, 0.0, 0.4]), limit="")
     with JogKeys(Typed([(0.0, 9.0, "right")]), 20.0) as keys:  # type: ignore[arg-type]
@@ -185,6 +186,20 @@ def test_a_key_that_waited_while_the_program_paused_begins_no_press(
             keys.take_cycle(record, held, prover)
             counts.append(held.hold.call_count)
     assert [counts[0] > 0, *(b > a for a, b in pairwise(counts))] == [True, True, False, True]
+
+
+def test_a_wall_clock_that_is_set_back_ends_no_later_press(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As NTP does; the keys and consoles of one jog session share the numbers."""
+    wall = iter([1_800_000_000_000_000_000, 1_799_999_998_000_000_000])
+    monkeypatch.setattr(time, "time_ns", lambda: next(wall))
+    record: Any = SimpleNamespace(state=State.MOVING, at=0.0)
+    prover: Any = SimpleNamespace(pose=Pose.level([0.0, 0.0, 0.4]), limit="")
+    held = Mock()
+    for _ in range(2):
+        with JogKeys(Typed([(0.0, 9.0, "right")]), 20.0) as keys:  # type: ignore[arg-type]
+            keys.take_cycle(record, held, prover)
+    first, second = (one.args[0] for one in held.hold.call_args_list)
+    assert second >= first
 
 
 @pytest.mark.parametrize(("rigs", "asked", "shown"), [(10, 20, 10.0), (50, 20, 20.0)])

@@ -20,10 +20,10 @@ SCENE = CONFIGS / "environment_1.yaml"
     [
         (["--mode", "paper"], ["optimal", "--mode"]),
         (["--max-iterations", "9"], ["optimal", "--max-iterations"]),
-        (["--spacing-mm", "30"], ["optimal", "--spacing-mm"]),
-        (["--steer", "full-step", "--goal-sight"], ["optimal", "--goal-sight, --steer"]),
-        (["--planner", "goal-bias", "--failure-rate", "tree"], ["goal-bias", "--failure-rate"]),
-        (["--planner", "adaptive", "--steer", "full-step"], ["--steer", "--mode paper"]),
+        (
+            ["--mode", "paper", "--max-iterations", "9"],
+            ["optimal", "--max-iterations, --mode"],
+        ),
         (["--planner", "adaptive", "--rounds", "5"], ["adaptive", "--rounds"]),
         (["--planner", "goal-bias", "--budget-ms", "5"], ["goal-bias", "--budget-ms"]),
         (["--planner", "adaptive", "--weight", "length=1"], ["adaptive", "--weight"]),

@@ -1091,6 +1091,22 @@ def test_one_page_of_all_consoles_of_a_robot_has_control(monkeypatch: pytest.Mon
         console.close()
 
 
+def test_a_wall_clock_that_is_set_back_ends_no_press_of_another_console(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As NTP does: the buttons of the other console did nothing until it had caught up."""
+    wall = iter([1_800_000_000_000_000_000, 1_799_999_998_000_000_000])
+    monkeypatch.setattr(time, "time_ns", lambda: next(wall))
+    numbers = list[int]()
+    for console in (Served().console, Served().console):
+        page = console.control.join("host")
+        console.control.take(page, moving=False)
+        press = console.control.hold(page, 1, 1, 1)
+        assert press is not None
+        numbers.append(press)
+    assert numbers == sorted(numbers)
+
+
 def test_a_console_begins_without_its_serial_adapter_and_gives_control_with_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

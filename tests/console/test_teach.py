@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cdpr.console.teach import MOST, TaughtPoses, scene_text
-from model.errors import BadInput, CdprError
+from model.errors import BadInput, CdprError, InvalidFile
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import load_rig
 from model.scene import empty_scene, load_scene, scene_from_document
@@ -76,6 +76,28 @@ def test_two_consoles_with_one_file_lose_no_pose_of_each_other(tmp_path: Path) -
         second.forget("b")
     second.move("c", 0)
     assert [one["name"] for one in TaughtPoses(tmp_path / "poses.json").as_dicts()] == ["c", "a"]
+
+
+def test_blanks_around_a_name_distinguish_no_poses(tmp_path: Path) -> None:
+    """They are not stored: "Go to" would then find the first of two poses of one name."""
+    taught = TaughtPoses(tmp_path / "poses.json")
+    taught.teach(" A", pose(1))
+    taught.teach("B", pose(2))
+    with pytest.raises(BadInput, match="there is a pose 'A' already"):
+        taught.teach("A ", pose(3))
+    with pytest.raises(BadInput, match="there is a pose 'A' already"):
+        taught.rename("B", " A")
+    taught.rename("A", "A ")
+    assert [one["name"] for one in taught.as_dicts()] == ["A", "B"]
+
+
+@pytest.mark.parametrize("second", ["A", " A"])
+def test_a_file_with_two_poses_of_one_name_is_refused(tmp_path: Path, second: str) -> None:
+    path = tmp_path / "poses.json"
+    poses = [{"name": name, "position_mm": [0.0, 0.0, 400.0]} for name in ("A", "B", second)]
+    path.write_text(json.dumps({"schema_version": 1, "poses": poses}))
+    with pytest.raises(InvalidFile, match=r"poses\.json: poses: pose name 'A' appears twice"):
+        TaughtPoses(path)
 
 
 def test_they_become_a_scene_that_is_read_again(tmp_path: Path) -> None:

@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 
-from drivers.can_errors import DriveRestarted
 from drivers.cia402.expected_objects import SIMULATED, are_simulated
+from drivers.setup_refusals import DriveRestarted
 from model.errors import HardwareMissing, Refused
 
 Answer = bytes | None | Exception

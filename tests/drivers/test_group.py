@@ -16,7 +16,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings
-from drivers.can_errors import TorqueLost
 from drivers.cia402.object_dictionary import PDO_NO_RTR, Setting, settings_for
 from drivers.cia402.pdo import NmtCommand, NmtState
 from drivers.cia402.profile import load_profile
@@ -24,6 +23,7 @@ from drivers.cia402.sdo import SetupNetwork
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import GroupCommand, GroupState
 from drivers.factory import make_drive_group
+from drivers.setup_refusals import TorqueLost
 from model.errors import Fault, HardwareMissing, Refused
 from model.files.rig_file import RigDocument
 from model.rig import Rig, rig_from_document

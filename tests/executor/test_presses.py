@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from time import CLOCK_BOOTTIME
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from executor.hold_to_run.presses import (
     PressReader,
     PressRule,
     PressState,
+    press_clock,
 )
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -37,6 +39,12 @@ class Time:
 @pytest.fixture
 def time() -> Time:
     return Time()
+
+
+def test_press_numbers_are_milliseconds_since_the_boot(monkeypatch: pytest.MonkeyPatch) -> None:
+    clocks = {CLOCK_BOOTTIME: 7_000_123_456_789}
+    monkeypatch.setattr("time.clock_gettime_ns", clocks.__getitem__)
+    assert press_clock() == 7_000_123
 
 
 @pytest.fixture

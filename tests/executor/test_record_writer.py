@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import resource
 import threading
 from pathlib import Path
@@ -113,6 +114,57 @@ def test_a_disk_that_hangs_holds_nothing_up_and_is_a_fault_when_it_is_far_behind
             goes_on.set()
 
 
+class Disk:
+    """Keeps the first write until it is let go; ``room`` limits the size of a write, [rows]."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, room: float = math.inf) -> None:
+        self.begins, self.goes_on = threading.Event(), threading.Event()
+        self.writes = 0
+        append = RunFolder.append_cycles
+
+        def writes(folder: RunFolder, lines: str, *, fsync: bool) -> None:
+            self.begins.set()
+            self.goes_on.wait()
+            self.writes += 1
+            if lines.count("\n") > room:
+                raise Fault("No space left on device")
+            append(folder, lines, fsync=fsync)
+
+        monkeypatch.setattr(RunFolder, "append_cycles", writes)
+
+    def record(self, folder: RunFolder, cycles: int) -> RecordWriter:
+        """Records cycles, all of which but the first wait for it."""
+        log: Any = Log()
+        with RecordWriter(folder, log, own_thread=True) as writer:
+            try:
+                for number in range(cycles):
+                    log.count += 1
+                    writer.take_cycles(5.0 + number * CYCLE)
+                    assert self.begins.wait(60.0)
+            finally:
+                self.goes_on.set()
+        return writer
+
+
+def test_cycles_that_waited_for_the_disk_are_written_together(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One by one, a disk that takes longer for each write than they are apart falls behind."""
+    disk = Disk(monkeypatch)
+    disk.record(folder, 401)
+    assert recorded(folder) == list(range(401))
+    assert disk.writes <= 3, "the first cycle, those that waited, and the rest at the end"
+
+
+def test_a_disk_without_room_for_all_that_waited_gets_what_fits(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(monkeypatch, room=100)
+    writer = disk.record(folder, 401)
+    assert recorded(folder) == list(range(401))
+    writer.take_event(RunEvent(9.0, "stop", "stop requested"))
+
+
 def full_at(size: int, folder: RunFolder) -> RecordWriter:
     """A writer with a file size limit: part of the last write still fits."""
     log: Any = Log()
@@ -141,13 +193,15 @@ def test_a_full_disk_is_a_fault_and_leaves_whole_lines(folder: RunFolder) -> Non
 def test_a_file_is_written_behind_all_cycles_and_also_after_a_failure(
     folder: RunFolder, monkeypatch: pytest.MonkeyPatch, own_thread: bool
 ) -> None:
-    log, seen = Log(), list[list[int]]()
+    log, seen, fails = Log(), list[list[int]](), threading.Event()
     with RecordWriter(folder, log, own_thread=own_thread) as writer:  # type: ignore[arg-type]
         for number in range(75):
             log.count += 1
             writer.take_cycles(5.0 + number * CYCLE)
         writer.take_file(lambda: seen.append(recorded(folder)))
         writer.take_file(lambda: monkeypatch.setattr(RunFolder, "append_cycles", _full))
+        writer.take_file(fails.set)
+        assert fails.wait(60.0)
         log.count += 1
         writer.take_file(lambda: seen.append(recorded(folder)))
     assert seen == [list(range(75))] * 2

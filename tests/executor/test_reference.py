@@ -11,11 +11,12 @@ from typing import Any, NoReturn
 import numpy as np
 import pytest
 
-from drivers.can_errors import BusDown, TorqueLost
+from drivers.can_errors import BusDown
 from drivers.cia402.group import Cia402Group
 from drivers.drive_group import DriveSnapshot
 from drivers.odrive.messages import AxisState, status_word
 from drivers.plausibility import require_within_limits
+from drivers.setup_refusals import TorqueLost
 from executor import drives
 from executor.control import path_runs
 from executor.control.preconditions import require_still_referenced

@@ -23,9 +23,10 @@ from hypothesis.extra.numpy import arrays
 
 from executor.recording import record_files, table_files
 from executor.recording.clearance import ClearanceTable, no_clearance
-from executor.recording.recorder import ROW, ROW_PER_CABLE
 from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.recording.tables import (
+    ROW,
+    ROW_PER_CABLE,
     CycleTable,
     PoseTable,
     quaternions_of,

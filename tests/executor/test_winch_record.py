@@ -6,17 +6,22 @@ import csv
 import errno
 import json
 import os
+import re
 import threading
 from concurrent.futures import wait
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from executor.control.winch_motion import recording
+from executor.control.winch_motion import WinchResult, recording
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.winch_runs import supervised
 from model.errors import BadInput, Fault, Refused
+from tests.configs import GACHON
 
 
 def record(cycle: int) -> CycleRecord:
@@ -25,6 +30,20 @@ def record(cycle: int) -> CycleRecord:
         cycle, 100.0 + cycle / 100.0, state, 0.0, 1.0, (10, 20), (11, -21), (30, 40), (0, 0), 0,
         0, 0, nothing, 0.0, (False, False),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize("interface", ["virtual", "socketcan"])
+def test_a_fault_leads_out_by_the_status_of_the_drives(interface: str) -> None:
+    """A reset alone is refused while a drive is in fault and the others hold the platform."""
+    nothing = np.full(8, np.nan)
+    result = WinchResult(State.LATCHED, "cable 2 is in fault", nothing, nothing, nothing)
+    supervisor = SimpleNamespace(during=lambda _board, move: move())
+    commands: Any = SimpleNamespace(supervisor=supervisor, board=None, require_no_stop=lambda: None)
+    rig = GACHON if interface == "virtual" else GACHON.with_bus(interface, "can0")
+    with pytest.raises(Fault, match="cable 2 is in fault") as caught:
+        supervised(rig, commands, lambda: result)
+    named = re.findall(r"`cdpr (\w+)", caught.value.next_step)
+    assert named == ([] if interface == "virtual" else ["status", "release", "reset"])
 
 
 def test_every_cycle_and_event_is_there(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from calibration.geometry.measurements import read_rig_data
 from executor.recording.table_files import TableFile
 from model.errors import BadInput, InvalidFile
+from model.files.csv_table import CsvTable
 from model.files.documents import load_yaml
 from model.files.reading import (
     READING_NEEDS,
@@ -79,6 +80,35 @@ def test_a_csv_file_is_the_same_with_any_line_ends(tmp_path: Path, end: str) -> 
     file = CsvFile(tmp_path / "a.csv")
     assert file.rows == [["a", "b"], ["1", "2"], ["3", "4"]]
     assert file.lines == [1, 2, 4], "as an editor counts them"
+
+
+def test_columns_and_lines_that_a_spreadsheet_left_empty_are_ignored(tmp_path: Path) -> None:
+    """It writes every cell that was used once."""
+    (tmp_path / "a.csv").write_text(",,,\na,b,,\n1,2,,\n,,,\n , ,,\n3,4,,\n,,,\n")
+    table = CsvTable(tmp_path / "a.csv")
+    assert table.of(["a", "b"]).tolist() == [[1.0, 2.0], [3.0, 4.0]]
+    assert [table.line(row) for row in range(2)] == [3, 6], "as an editor counts them"
+    with pytest.raises(BadInput) as caught:
+        table.of(["c"])
+    assert caught.value.next_step == "name it in the first line, which has: a, b"
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("a,b,a\n1,2,3\n", "the column 'a' appears twice"),
+        ("a,b\n1,\n", "line 2, b: '' is not a finite number"),
+        ("a,b,\n1,2\n", "line 2 has 2 values for 3 columns"),
+        ("a,b\n,\n", "the file holds no values"),
+    ],
+)
+def test_a_table_by_other_programs_is_refused_with_the_reason(
+    tmp_path: Path, text: str, what: str
+) -> None:
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(BadInput) as caught:
+        CsvTable(tmp_path / "a.csv").of(["a", "b"])
+    assert caught.value.what == what
 
 
 def test_a_field_that_never_ends_is_reported_with_its_line(tmp_path: Path) -> None:

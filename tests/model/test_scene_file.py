@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import math
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -364,9 +366,18 @@ def test_a_scene_cannot_be_changed_into_an_invalid_one(change: dict[str, Any]) -
 
 
 @pytest.mark.parametrize("name", ["environment_1", "environment_2", "environment_3", "hall_pillar"])
-def test_the_example_scenes_load_the_same_twice(name: str) -> None:
-    path = CONFIGS / f"{name}.yaml"
-    assert load_scene(path).hash == load_scene(path).hash
+def test_the_hash_of_a_scene_depends_on_each_obstacle_but_not_on_the_layout(
+    name: str, tmp_path: Path
+) -> None:
+    expected = load_scene(CONFIGS / f"{name}.yaml").hash
+    data = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text(encoding="utf-8"))
+    path = tmp_path / "scene.yaml"
+    path.write_text(yaml.safe_dump(data), encoding="utf-8")  # in another order, without comments
+    assert load_scene(path).hash == expected
+    for index, axis in product(range(len(data["obstacles"])), range(3)):
+        changed = copy.deepcopy(data)
+        changed["obstacles"][index]["position_mm"][axis] += 0.001
+        assert scene_of(changed).hash != expected
 
 
 def bowl(rings: int) -> dict[str, Any]:

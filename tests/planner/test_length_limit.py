@@ -13,9 +13,9 @@ from model.errors import BadInput, distinct_figures
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import empty_scene
-from planner.costs import KinematicCost
+from planner.costs import KinematicCost, LengthLimit
 from planner.endpoints import require_feasible_length, require_usable_ends
-from planner.path import LengthLimit, smallest_gap
+from planner.path import smallest_gap
 from planner.settings import OptimalSettings
 
 STRAIGHT = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])

@@ -136,7 +136,6 @@ def test_an_option_alone_is_found() -> None:
 PAGE = re.compile(r"docs/[\w/-]+\.md")
 RELATIVE = {
     "cdpr/cli/calibrate/rig.py": "a help text: `cdpr --help` states where docs/ is",
-    "cdpr/cli/plan.py": "a help text, too",
     "planner/parallel.py": "about a source checkout",
 }
 

@@ -62,7 +62,8 @@ def test_a_run_engages_it_and_only_a_good_end_disengages_it(tmp_path: Path) -> N
     latch.settle("rig", State.LATCHED, "cable 6 is slack", tmp_path)
     with pytest.raises(Refused, match="cable 6 is slack") as caught:
         FaultLatch(BUS).require_disengaged()
-    assert "cdpr reset" in caught.value.next_step
+    step = caught.value.next_step
+    assert step.index("`cdpr status RIG`") < step.index("`cdpr reset RIG`")
     with pytest.raises(Refused, match="cable 6 is slack"):
         FaultLatch(BUS).engage("rig", tmp_path)
     FaultLatch(BUS).disengage()

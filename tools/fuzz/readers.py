@@ -31,7 +31,6 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     """All readers; run folders are copied into ``scratch``."""
     from calibration.extrinsics.hand_eye import read_poses
     from calibration.geometry.measurements import read_rig_data
-    from calibration.intrinsics.exchange import imported_camera
     from calibration.result_files import load_result
     from calibration.targets.boards import read_corners
     from cdpr.console.teach import TaughtPoses
@@ -64,7 +63,7 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
         "places": lambda path: read_rig_data(path, 8),
         "poses": read_poses,
         "corners": read_corners,
-        "camera": lambda path: imported_camera(path, rig.document.cameras[0]),
+        "camera": lambda path: _import_camera(rig, path),
         "coordinates": read_coordinates,
         "reference": ReferenceFile(bus)._read,
         "latch": lambda path: _at(FaultLatch(bus), path).read(),
@@ -96,6 +95,15 @@ def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     ]
     unfinished = [Reader(f"cut:{seed.name}", seed, _cut, cut / seed.name) for seed in corpus["cut"]]
     return found + whole + again + unfinished + _checksums(corpus["checksums"][0], scratch)
+
+
+def _import_camera(rig: Any, path: Path) -> None:
+    """Imports a camera file into a new rig file."""
+    from calibration.intrinsics.exchange import write_rig_with_camera
+
+    output = path.with_name("imported.yaml")
+    output.unlink(missing_ok=True)
+    write_rig_with_camera(output, rig, rig.cameras[0].name, path)
 
 
 def _checksums(seed: Path, scratch: Path) -> list[Reader]:

@@ -33,7 +33,7 @@ from cdpr.cli.output import err, out, show_json, show_line
 from executor import jogging
 from executor.drives import is_simulated
 from executor.hold_to_run.line import JogProver
-from executor.hold_to_run.presses import TIMEOUT, PressBoard
+from executor.hold_to_run.presses import TIMEOUT, PressBoard, press_clock
 from executor.hold_to_run.session import cable_session, jog_session
 from executor.jogging import FASTEST, SPEED
 from executor.state_machine import CycleRecord, State
@@ -323,7 +323,7 @@ class JogKeys:
         if key == self._key and self._send(presses):
             return
         self._key = key
-        self._number = max(self._number + 1, time.time_ns() // 1_000_000)
+        self._number = max(self._number + 1, press_clock())
         self._send(presses)
 
     def _send(self, presses: PressBoard) -> bool:

@@ -35,7 +35,7 @@ from model.rig import Rig, rig_from_document
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.cia402 import SimulatedDrive
 from simulation.drives.eds_file import profile_path
-from simulation.fault_bus import FaultBus, lose
+from tests.scenarios.faults.fault_bus import FaultBus, lose
 from tests.scenarios.faults.masters import StartsMasters, gone
 from tests.scenarios.faults.samples import Limits, Stopped, WatchedRehearsal, stopped, violations
 from tests.scenarios.stage import Stage

@@ -22,9 +22,9 @@ from executor.safety.monitor import MonitorLimits
 from executor.safety.stall import STUCK_CYCLES
 from executor.state_machine import State
 from simulation.drives.behaviour import STRICT, DriveBehaviour, behaviour_named
-from simulation.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
 from tests.drivers.drive_bench import make_reply
 from tests.scenarios.faults.bench import EVERY_ID, Bench, Script, SimulatedBench, a_message, once
+from tests.scenarios.faults.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
 from tests.scenarios.faults.samples import emergencies, left_holding
 
 NODES = range(1, 9)
@@ -41,7 +41,7 @@ class Fault:
     """One line of the table.
 
     Attributes:
-        script: Makes the script, anew for every run.
+        script: Makes a new script for every run.
         ends: How the run ends; None when its process is dead.
         within: Cycles from the fault until no drive follows set-points; None if the run continues.
         late: Cycles more in real time, where the stop waits for a cycle that may begin late.
@@ -389,13 +389,13 @@ TABLE: dict[str, Fault] = {
         words=("(drive 2) did not move",),
         code="drive_stuck",
     ),
-    "F17 a winch jams, its drive tells": Fault(
+    "F17 a winch jams, its drive reports it": Fault(
         broken(1, by=jam_seen_by_the_drive),
         within=REPORTED_BY_DRIVE,
         late=MAY_BE_LATE,
         words=("drive 2", "following error"),
     ),
-    "F17 a winch slips, its drive sleeps": Fault(
+    "F17 a winch slips, its drive does not monitor it": Fault(
         broken(1, by=slip),
         within=BELIEVED,
         late=MAY_BE_LATE,

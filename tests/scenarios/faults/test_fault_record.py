@@ -13,9 +13,9 @@ from drivers.cia402.pdo import RPDO1_BASE
 from executor.recording.tables import CycleTable
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
-from simulation.fault_bus import lose_next
 from tests.scenarios.faults.bench import Script, once, simulated
 from tests.scenarios.faults.cases import TABLE, incoming, late
+from tests.scenarios.faults.fault_bus import lose_next
 from tests.scenarios.stage import concluded
 from tests.scenarios.test_faults import jump_in_table
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.can_load import frame_bits
-from simulation.fault_bus import FaultBus, delay, lose, lose_next, repeat, spoil
+from tests.scenarios.faults.fault_bus import FaultBus, delay, lose, lose_next, repeat, spoil
 
 _CHANNELS = itertools.count()
 
