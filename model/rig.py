@@ -16,13 +16,13 @@ from model.cameras import (
     Camera,
     FinishedCalibration,
     Tag,
+    camera_by_name,
     camera_from,
     corrected,
     tag_from,
 )
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, load_yaml, millimetres
-from model.files.reading import docs_page
 from model.files.rig_file import BusDocument, MotionDocument, RigDocument, WinchDocument
 from model.files.validation import key_path
 from model.pages.page import html_table
@@ -289,23 +289,7 @@ class Rig(ReadOnly):
         Raises:
             BadInput: The rig has none of this name, or none at all.
         """
-        names = [camera.name for camera in self.cameras]
-        if not names:
-            raise BadInput(
-                "the rig file has no camera",
-                where=self.name,
-                next_step="add `tags` and `cameras`, as in the example of"
-                f" {docs_page('rig-file.md')} (Tags and cameras)",
-            )
-        if name is None:
-            return self.cameras[0]
-        if name not in names:
-            raise BadInput(
-                f"unknown camera {name!r}",
-                where=self.name,
-                next_step=f"name one of: {', '.join(names)}",
-            )
-        return self.cameras[names.index(name)]
+        return camera_by_name(self.cameras, name, self.name)
 
     def with_bus(self, interface: str | None = None, channel: str | None = None) -> Rig:
         """The same rig on another CAN bus, in memory only; a plan does not depend on the bus.
