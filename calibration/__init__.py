@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING
 from model.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from calibration.extrinsics.camera_pairs import locate_camera_by_another
     from calibration.extrinsics.result import ExtrinsicsResult
     from calibration.geometry.pose_selection import measurement_poses
     from calibration.geometry.result import RigResult
+    from calibration.intrinsics.readout import ReadoutResult
     from calibration.intrinsics.result import CameraResult
-    from calibration.result_files import load_result
+    from calibration.procedures import calibrate_camera_from_corners, measure_readout
+    from calibration.result_files import Comparison, compare, load_result
     from calibration.results import Calibration, ResultDocument
     from calibration.tag_map.result import TagsResult
     from calibration.targets.boards import Charuco, Chessboard
@@ -23,12 +26,18 @@ __all__ = [
     "Charuco",
     "Chessboard",
     "CircleGrid",
+    "Comparison",
     "ExtrinsicsResult",
+    "ReadoutResult",
     "ResultDocument",
     "RigResult",
     "TagGrid",
     "TagsResult",
+    "calibrate_camera_from_corners",
+    "compare",
     "load_result",
+    "locate_camera_by_another",
+    "measure_readout",
     "measurement_poses",
 ]
 
@@ -36,11 +45,14 @@ if not TYPE_CHECKING:
     __getattr__, __dir__ = lazy_names(
         __name__,
         {
+            "calibration.extrinsics.camera_pairs": "locate_camera_by_another",
             "calibration.extrinsics.result": "ExtrinsicsResult",
             "calibration.geometry.pose_selection": "measurement_poses",
             "calibration.geometry.result": "RigResult",
+            "calibration.intrinsics.readout": "ReadoutResult",
             "calibration.intrinsics.result": "CameraResult",
-            "calibration.result_files": "load_result",
+            "calibration.procedures": "calibrate_camera_from_corners measure_readout",
+            "calibration.result_files": "Comparison compare load_result",
             "calibration.results": "Calibration ResultDocument",
             "calibration.tag_map.result": "TagsResult",
             "calibration.targets.boards": "Charuco Chessboard",

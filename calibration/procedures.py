@@ -30,7 +30,7 @@ from calibration.intrinsics.calibrate import (
     fit_corners,
     refit_camera,
 )
-from calibration.intrinsics.lens import AUTO
+from calibration.intrinsics.lens import AUTO, LENSES
 from calibration.intrinsics.quality import CameraQuality, judge_camera
 from calibration.intrinsics.readout import (
     ReadoutCalibration,
@@ -66,6 +66,7 @@ from model.errors import (
     Refused,
     path_of,
     positive_number,
+    require_text,
     require_types,
     sequence_of,
     truth_value,
@@ -73,8 +74,9 @@ from model.errors import (
 from model.kinematics import NoCable
 from model.pose import Pose, point_of, read_only
 from model.progress import SILENT, Listener
-from model.rig import Camera, Rig
+from model.rig import Rig
 from model.scene import require_unaltered
+from planner.settings import whole_number
 
 CameraOutcome = Calibration[CameraResult, CameraCalibration, CameraQuality]
 TagsOutcome = Calibration[TagsResult, TagLayout, CalibrationVerdict]
@@ -110,7 +112,7 @@ def calibrate_camera(
         BadInput: Image sizes differ, or too few images show the board.
     """
     require_types((board, Board), (listener, Listener))
-    wanted, distance = _required(wanted, distance)
+    wanted, distance = _required(wanted, distance, lens)
     require_file_name(name, "`name=`")
     source = folder if isinstance(folder, ImageSet) else open_images(path_of(folder))
     to = Destination.of(output)
@@ -124,7 +126,7 @@ def calibrate_camera(
 
 
 def calibrate_camera_from_corners(
-    corners: Path,
+    corners: str | Path,
     size: tuple[int, int],
     *,
     name: str = "camera",
@@ -138,25 +140,32 @@ def calibrate_camera_from_corners(
     Args:
         corners: A CSV file (docs/data-formats.md).
         size: Width and height of the images, [px].
-        name: Of the camera.
+        name: Of the camera in the rig file.
         wanted: Required error, 95 %, [m].
-        distance: Working distance of the camera, [m].
-        lens: One of `calibration.intrinsics.lens.LENSES`, or `AUTO`.
-        output: Folder for the result.
+        distance: Working distance of the camera, [m]; that of the boards when left out.
+        lens: As for `calibrate_camera`.
+        output: Folder for the result file and its report; nothing is written when left out.
 
     Raises:
-        BadInput: The file cannot be read, or as in `fit_corners`.
+        BadInput: The file cannot be read, too few images, or corners outside them.
     """
-    wanted, distance = _required(wanted, distance)
+    wanted, distance = _required(wanted, distance, lens)
     require_file_name(name, "`name=`")
+    sides = sequence_of("size", size)
+    if len(sides) != 2:
+        raise BadInput(f"size must be the width and height of the images in px, it is {size!r}")
+    width, height = (whole_number("size", side, 1) for side in sides)
     to = Destination.of(output)
     to.require_free("camera", name)
-    found = fit_corners(*read_corners(path_of(corners)), size, lens, str(corners))
+    found = fit_corners(*read_corners(path_of(corners)), (width, height), lens, str(corners))
     return _judged_camera(found, name, wanted, distance, to)
 
 
-def _required(wanted: float, distance: float | None) -> tuple[float, float | None]:
-    """Required error and working distance, checked, [m]."""
+def _required(wanted: float, distance: float | None, lens: str) -> tuple[float, float | None]:
+    """Required error and working distance, [m], checked as the name of the lens is."""
+    require_text(lens=lens)
+    if lens not in (AUTO, *LENSES):
+        raise BadInput(f"unknown lens {lens!r}", next_step=f"use {', '.join((AUTO, *LENSES))}")
     needed = positive_number("wanted", wanted, "m")
     return needed, None if distance is None else positive_number("distance", distance, "m")
 
@@ -275,9 +284,9 @@ def locate_tags(
 
 def measure_readout(
     rig: Rig,
-    camera: Camera,
     source: str | Path,
     *,
+    camera: str | None = None,
     rate: float | None = None,
     speed: float | None = None,
     wanted: float = 0.1e-3,
@@ -288,8 +297,9 @@ def measure_readout(
 
     Args:
         rig: The robot; its platform moves in the images and carries tags.
-        camera: At rest; its matrix and distortion are taken as known.
-        source: A video, or a folder of consecutive images.
+        source: A video, or a folder of consecutive images; taken while the camera is at rest.
+        camera: Which of the rig's cameras took them; the first when left out. Its matrix and
+            distortion are taken as known.
         rate: Frame rate of a folder, or of a video without times, [Hz]; the camera's when left out.
         speed: Platform speed for which the error is stated, [m/s]; the rig's when left out.
         wanted: Required error, 95 %, [m].
@@ -300,23 +310,24 @@ def measure_readout(
         BadInput: There are no tags, or the images do not determine the readout or are rotated by
             90°.
     """
-    require_types((rig, Rig), (camera, Camera), (listener, Listener))
+    require_types((rig, Rig), (listener, Listener))
     require_unaltered(rig)
     wanted = positive_number("wanted", wanted, "m")
+    taken_by = rig.camera(camera)
     rate = None if rate is None else positive_number("rate", rate, "Hz")
     speed = rig.motion.speed if speed is None else positive_number("speed", speed, "m/s")
-    require_file_name(camera.name, "cameras")
+    require_file_name(taken_by.name, "cameras")
     require_tags(rig, None)
-    rolling = replace(camera, readout=camera.readout or inf)  # takes no rotated images
+    rolling = replace(taken_by, readout=taken_by.readout or inf)  # takes no rotated images
     pictures, known = open_timed_images(path_of(source), rolling, rate, listener)
     to = Destination.of(output)
-    to.require_free("readout", camera.name)
+    to.require_free("readout", taken_by.name)
     ready_to_measure(listener)
     with pictures.reported("detecting tags", listener) as images:
         numbers = [tag.id for tag in rig.platform_tags]
-        observations = observe_tags(images, rig, camera, numbers, pictures.unused)
+        observations = observe_tags(images, rig, taken_by, numbers, pictures.unused)
     times = {name: known[name] for name in observations.squares}
-    found = fit_readout(rig, camera, observations, times)
+    found = fit_readout(rig, taken_by, observations, times)
     verdict = judge_readout(found, wanted, speed)
     result = readout_result(found, verdict, speed, to.on)
     page = readout_page(found, verdict, result.date)

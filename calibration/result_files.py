@@ -17,7 +17,7 @@ from calibration.results import ResultDocument
 from calibration.statistics import Interval
 from calibration.tag_map.result import TagsResult
 from model.cameras import in_order, left_out_errors
-from model.errors import BadInput
+from model.errors import BadInput, require_types
 from model.files.documents import load_yaml, read_yaml, write_atomic
 from model.progress import SILENT, Listener
 from model.rig import Rig
@@ -206,6 +206,7 @@ def compare(first: ResultDocument, second: ResultDocument) -> Comparison:
     Raises:
         BadInput: They differ in kind or name.
     """
+    require_types((first, ResultDocument), (second, ResultDocument))
     if (first.kind, first.name) != (second.kind, second.name):
         raise BadInput(
             f"a result of kind {first.kind} for {first.name!r} cannot be compared with one of kind"

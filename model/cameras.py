@@ -8,8 +8,9 @@ from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
-from model.errors import BadInput
+from model.errors import BadInput, require_text
 from model.files.camera_file import CameraDocument, Gamma, TagDocument
+from model.files.reading import docs_page
 from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, ReadOnly, read_only
 from model.progress import Listener
@@ -109,6 +110,38 @@ class Camera(ReadOnly):
 def tag_from(document: TagDocument) -> Tag:
     """The tag that a rig file describes."""
     return Tag(id=document.id, size=document.size_mm / 1000.0, pose=document.pose())
+
+
+def camera_by_name(cameras: Sequence[Camera], name: str | None, where: str) -> Camera:
+    """The camera of a name; the first when no name is given.
+
+    Args:
+        cameras: Of a rig.
+        name: Of the camera in the rig file.
+        where: The rig, for messages.
+
+    Raises:
+        BadInput: There is none of this name, or none at all.
+    """
+    if name is not None:
+        require_text(name=name)
+    names = [camera.name for camera in cameras]
+    if not names:
+        raise BadInput(
+            "the rig file has no camera",
+            where=where,
+            next_step="add `tags` and `cameras`, as in the example of"
+            f" {docs_page('rig-file.md')} (Tags and cameras)",
+        )
+    if name is None:
+        return cameras[0]
+    if name not in names:
+        raise BadInput(
+            f"unknown camera {name!r}",
+            where=where,
+            next_step=f"name one of: {', '.join(names)}",
+        )
+    return cameras[names.index(name)]
 
 
 def camera_from(document: CameraDocument) -> Camera:

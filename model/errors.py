@@ -147,6 +147,7 @@ _MAKERS = {
     "Plan": "cdpr.load_plan",
     "Pose": "cdpr.Pose.level",
     "CalibrationResult": "cdpr.load_calibration",
+    "ResultDocument": "cdpr.load_calibration",
 }
 _UNITS = {"Pose": ", with the position in metres"}
 _OTHERS = {

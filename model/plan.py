@@ -146,7 +146,8 @@ def load_plan(path: str | Path) -> Plan:
     path = path_of(path)
     data = _json_object(path)
     if data.get("kind") != "cdpr-plan":
-        raise BadInput("this is not a plan file", where=str(path), next_step=PLAN_AGAIN)
+        why = "its key `kind` must be `cdpr-plan`"
+        raise BadInput("this is not a plan file", where=str(path), why=why, next_step=PLAN_AGAIN)
     check_version(data, PlanDocument, path, {}, PLAN_AGAIN)
     try:
         document = PlanDocument.model_validate(data)

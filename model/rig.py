@@ -16,13 +16,13 @@ from model.cameras import (
     Camera,
     FinishedCalibration,
     Tag,
+    camera_by_name,
     camera_from,
     corrected,
     tag_from,
 )
 from model.errors import BadInput, path_of, require_types
 from model.files.documents import document_hash, document_of, load_yaml, millimetres
-from model.files.reading import docs_page
 from model.files.rig_file import BusDocument, MotionDocument, RigDocument, WinchDocument
 from model.files.validation import key_path
 from model.pages.page import html_table
@@ -83,7 +83,18 @@ class Winch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Motion:
-    """Limits of motion along a path, SI."""
+    """Limits of motion along a path.
+
+    Attributes:
+        speed: Of the platform's origin, [m/s].
+        acceleration: As `speed`, [m/s²].
+        jerk: As `speed`, [m/s³].
+        blend_tolerance: Largest distance of a rounded corner from the planned one, [m].
+        following_error: Largest following error of a cable, [m].
+        start_tolerance: Largest error of a cable's length at which a run starts, [m].
+        stuck_travel: Cable that set-points may advance while a drive is at rest, [m].
+        stuck_speed: Cable speed of set-points below which friction may hold a drive, [m/s].
+    """
 
     speed: float
     acceleration: float
@@ -105,12 +116,28 @@ class Rig(ReadOnly):
         anchors: Cable anchor points, platform frame, shape (m, 3), [m].
         pulley_radius: [m]; 0 for point exits.
         feed_directions: Travel of the cable entering each pulley, world frame, shape (m, 3).
-        half_size: Half extents of the platform box, shape (3,), [m].
+        half_size: Half extents of the platform box, platform frame, shape (3,), [m].
+        mass: Of the platform without payload, [kg].
+        centre_of_mass: Of the platform, platform frame, shape (3,), [m].
+        home: ``world_from_platform`` to which `Winch.home_counts` belong.
+        workspace_lower: Smallest coordinates of the platform's origin, world frame, shape (3,),
+            [m].
+        workspace_upper: Largest, as `workspace_lower`.
+        cable_radius: [m].
+        cable_stiffness: Axial, E·A of each cable, shape (m,), [N].
+        min_tension: Of every cable, [N].
+        max_tension: Of every cable, [N].
+        winches: One per cable, in the order of `outlets`.
+        motion: Limits of motion along a path.
+        tag_family: Of all tags; empty without tags.
+        tag_detector: "opencv" or "apriltag"; empty without tags.
+        platform_tags: Tags on the platform; empty where none are described.
+        frame_tags: Surveyed tags in the world; empty as above.
+        cameras: In the order of the file; empty as above.
         tag_error: Position error of the platform's tag corners, 95 %, [m]; None where the rig file
             does not state it.
         outlet_error: Error of outlets along any axis, 95 %, [m]; None as above.
         anchor_error: As `outlet_error`, for anchors.
-        cable_stiffness: Axial, E·A of each cable, shape (m,), [N].
     """
 
     document: RigDocument
@@ -141,7 +168,7 @@ class Rig(ReadOnly):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Rig:
-        """The rig of a rig file's keys and values; arrays are taken for lists.
+        """The rig of a rig file's keys and values; lists may be given as arrays.
 
         Raises:
             InvalidFile: With every key that does not fit.
@@ -262,23 +289,7 @@ class Rig(ReadOnly):
         Raises:
             BadInput: The rig has none of this name, or none at all.
         """
-        names = [camera.name for camera in self.cameras]
-        if not names:
-            raise BadInput(
-                "the rig file has no camera",
-                where=self.name,
-                next_step="add `tags` and `cameras`, as in the example of"
-                f" {docs_page('rig-file.md')} (Tags and cameras)",
-            )
-        if name is None:
-            return self.cameras[0]
-        if name not in names:
-            raise BadInput(
-                f"unknown camera {name!r}",
-                where=self.name,
-                next_step=f"name one of: {', '.join(names)}",
-            )
-        return self.cameras[names.index(name)]
+        return camera_by_name(self.cameras, name, self.name)
 
     def with_bus(self, interface: str | None = None, channel: str | None = None) -> Rig:
         """The same rig on another CAN bus, in memory only; a plan does not depend on the bus.

@@ -118,7 +118,7 @@ class Scene(ReadOnly):
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Scene:
-        """The scene of a scene file's keys and values; arrays are taken for lists.
+        """The scene of a scene file's keys and values; lists may be given as arrays.
 
         Raises:
             InvalidFile: With every key that does not fit.

@@ -43,8 +43,8 @@ class PoseMeasurement:
         reprojection: RMS error of their corners, [px].
         status: ``found`` (in the whole image), ``tracked`` (near the last pose) or ``guided`` (at
             the encoder pose).
-        shared: As `covariance`, of the errors common to all images, from extrinsics and tags, as
-            far as calibrations or the rig file state them.
+        shared: As `covariance`, of the errors common to all images, from lens, extrinsics and tags,
+            as far as calibrations or the rig file state them.
         unstated: Whether a part of these is not stated.
         at_rest: ``world_from_platform`` as for a global shutter; None if the camera has one.
         cable_error: Error of cables, 95 %, if the operator's value replaces stated errors, [m].

@@ -45,10 +45,11 @@ from calibration.targets.boards import Board, Charuco, DetectedBoard
 from calibration.targets.grids import TagGrid
 from executor.kernels import ready_to_measure
 from model.cameras import Z_95
-from model.errors import BadInput, positive_number
+from model.errors import BadInput, positive_number, require_text, require_types
 from model.pose import Array, Pose, matrix_from_rotation_vector, moved, read_only
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
+from model.scene import require_unaltered
 from tracking.camera_model import (
     Image,
     lever_arm_matrix,
@@ -341,10 +342,11 @@ def _gap(here: Pose, there: BodyObservation) -> Array:
 
 def locate_camera_by_another(
     rig: Rig,
-    camera: Camera,
-    reference: Camera,
-    sources: tuple[ImageSource, ImageSource],
+    source: ImageSource,
+    reference_source: ImageSource,
     *,
+    reference: str,
+    camera: str | None = None,
     board: Board | None = None,
     pictures: int | None = None,
     wanted: float = 1e-3,
@@ -355,10 +357,12 @@ def locate_camera_by_another(
 
     Args:
         rig: The robot.
-        camera: Its matrix and distortion are taken as known.
-        reference: Another camera of the rig; its pose is taken as known as well.
-        sources: Images of this and of the other camera; simultaneous ones have the same name, in
-            videos the same number.
+        source: A folder of images, or a video file.
+        reference_source: As `source`, of the other camera; simultaneous images have the same name,
+            in videos the same number.
+        reference: The other camera of the rig; its pose is taken as known, too.
+        camera: Which of the rig's cameras is located; the first when left out. Its matrix and
+            distortion are taken as known.
         board: The board that both see; the tags of the platform when left out.
         pictures: Number of images from each video; 20 when left out.
         wanted: Required error in the work space, 95 %, [m].
@@ -369,10 +373,14 @@ def locate_camera_by_another(
         BadInput: Both are one camera, the board has no unique orientation, a source is a live
             camera, or too few pairs.
     """
+    require_types((rig, Rig), (listener, Listener), optional=[(board, Board)])
+    require_unaltered(rig)
     wanted = positive_number("wanted", wanted, "m")
-    if camera.name == reference.name:
+    require_text(reference=reference)
+    both = located, other = rig.camera(camera), rig.camera(reference)
+    if located is other:
         raise BadInput(
-            f"camera {camera.name!r} cannot be located relative to itself",
+            f"camera {located.name!r} cannot be located relative to itself",
             next_step="choose another camera of the rig whose pose is known",
         )
     if board is None:
@@ -380,14 +388,13 @@ def locate_camera_by_another(
     else:
         require_oriented(board)
     to = Destination.of(output)
-    to.require_free("extrinsics", camera.name)
+    to.require_free("extrinsics", located.name)
     ready_to_measure(listener)
     seen: list[dict[str, BodyObservation]] = []
     unused: dict[str, str] = {}
-    both = (camera, reference)
     opened = [
-        open_source(source, one, pictures, DEFAULT_IMAGES)
-        for one, source in zip(both, sources, strict=True)
+        open_source(images, one, pictures, DEFAULT_IMAGES)
+        for one, images in zip(both, (source, reference_source), strict=True)
     ]
     _require_recorded(both, opened)
     for one, images in zip(both, same_images(opened), strict=True):
@@ -396,15 +403,15 @@ def locate_camera_by_another(
         unused |= {f"{one.name}: {name}": why for name, why in left_out.items()}
     own, others = seen
     alone = [name for name in own if name not in others]
-    unused |= {f"{camera.name}: {n}": f"no observation by camera {reference.name}" for n in alone}
+    unused |= {f"{located.name}: {n}": f"no observation by camera {other.name}" for n in alone}
     pairs = {name: (body, others[name]) for name, body in own.items() if name in others}
     numbers = (
         name.encode() + np.round(body.camera_from_body.matrix(), 9).tobytes()
         for name, pair in pairs.items()
         for body in pair
     )
-    found = locate_by_pairs(rig, camera, reference, pairs, unused, data_hash(numbers))
-    return judged_extrinsics(found, rig, camera, wanted, to)
+    found = locate_by_pairs(rig, located, other, pairs, unused, data_hash(numbers))
+    return judged_extrinsics(found, rig, located, wanted, to)
 
 
 def _require_recorded(cameras: Sequence[Camera], opened: Sequence[ImageSet]) -> None:

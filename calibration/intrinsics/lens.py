@@ -349,11 +349,11 @@ def error_of(fit: LensFit, seen: DetectedBoard) -> float:
 def choose_lens(views: Mapping[str, DetectedBoard], size: tuple[int, int]) -> LensFit:
     """The fit of the lens model selected by cross-validation.
 
-    Five coefficients, unless their errors show a radial pattern (`RADIAL`) or are large, as of a
-    lens wider than 180°, and another model has held-out errors lower by `GAIN` and by two standard
-    errors, in the geometric mean over the images, so that a few bad images, equally bad for every
-    model, do not hide the others. Of several such models, the one with the fewest parameters whose
-    error is within `NO_WORSE` of the best.
+    Five coefficients, unless their errors show a radial pattern (`RADIAL`) or are large, such as
+    those of a lens wider than 180°, and another model has held-out errors lower by `GAIN` and by
+    two standard errors, in the geometric mean over the images, so that a few bad images, equally
+    bad for every model, do not hide the others. Of several such models, the one with the fewest
+    parameters whose error is within `NO_WORSE` of the best.
 
     Raises:
         cv2.error: OpenCV finds no solution.

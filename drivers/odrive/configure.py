@@ -335,7 +335,7 @@ def _no_version(nodes: str) -> HardwareMissing:
     return HardwareMissing(
         f"drive{'s' if ',' in nodes else ''} {nodes}: heartbeats, but no Get_Version",
         where=SETTING_UP,
-        why="firmware 0.5, as of every ODrive 3.x, or an adapter without remote frames",
+        why="firmware 0.5, which every ODrive 3.x has, or an adapter without remote frames",
         next_step="use ODrive Pro, S1 or Micro, as 3.x has no firmware 0.6; if these are in use,"
         " check the adapter",
         values={"nodes": nodes},

@@ -198,8 +198,8 @@ _ALL_USERS = ["0", "0", "4294967295"]
 def has_capability(number: int) -> bool:
     """Whether this process has a capability (linux/capability.h) on the machine.
 
-    In a user namespace, as of a rootless container, it may have all of them; the kernel grants no
-    priority and locks no memory for those.
+    In a user namespace, such as that of a rootless container, it may have all of them; the kernel
+    grants no priority and locks no memory for those.
     """
     users = Path("/proc/self/uid_map")
     if users.exists() and users.read_text().split() != _ALL_USERS:

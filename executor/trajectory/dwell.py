@@ -47,7 +47,10 @@ def rows_of(dwell: float, cycle: float) -> int:
 def legs_at(
     dwells: Sequence[Dwell], indices: Array
 ) -> np.ndarray[tuple[int, ...], np.dtype[np.int64]]:
-    """Leg numbers, from 1, at table indices; a dwell belongs to the leg before it."""
+    """Leg numbers, from 1, at table indices.
+
+    A dwell belongs to the leg before it, except for its last row, which belongs to the next leg.
+    """
     lasts = np.array([dwell.last for dwell in dwells], dtype=np.float64)
     return 1 + np.searchsorted(lasts, indices, side="right").astype(np.int64)
 

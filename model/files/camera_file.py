@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal, get_args
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic.config import JsonDict
 
 from model.files.documents import (
     WHOLE_LARGEST,
@@ -17,6 +19,7 @@ from model.files.documents import (
     Number,
     PoseDocument,
     Positive,
+    in_schema,
 )
 
 #: Tag detectors: OpenCV, or pyapriltags from the extra `apriltag`.
@@ -73,6 +76,8 @@ FISHEYE = "fisheye"
 LENSES = ("pinhole", FISHEYE)
 """OpenCV's camera models, by the key `lens`."""
 LensName = Literal["pinhole", "fisheye"]
+COEFFICIENTS = {LENSES[0]: (0, 4, 5, 8, 12, 14), FISHEYE: (4,)}
+"""Numbers of distortion coefficients that a lens model may have."""
 
 
 def require_coefficients(lens: str, count: int) -> None:
@@ -81,11 +86,15 @@ def require_coefficients(lens: str, count: int) -> None:
     Raises:
         ValueError: The number does not fit the lens model.
     """
-    known = (4,) if lens == FISHEYE else (0, 4, 5, 8, 12, 14)
-    if count not in known:
-        *most, last = map(str, known)
+    if count not in COEFFICIENTS[lens]:
+        *most, last = map(str, COEFFICIENTS[lens])
         listed = f"{', '.join(most)} or {last}" if most else last
         raise ValueError(f"a {lens} lens needs {listed} coefficients, it has {count}")
+
+
+def _counted(counts: Sequence[int]) -> JsonDict:
+    """JSON schema of a list that has one of these numbers of entries."""
+    return {"anyOf": [{"minItems": count, "maxItems": count} for count in counts]}
 
 
 # Covariances of a calibrated camera.
@@ -104,23 +113,29 @@ def _is_covariance(rows: list[list[float]], count: int) -> list[list[float]]:
     return rows
 
 
-def _is_covariance_of_numbers(rows: list[list[float]]) -> list[list[float]]:
-    return _is_covariance(rows, len(rows))
-
-
 def _has_six_rows(rows: list[list[float]]) -> list[list[float]]:
     if len(rows) != 6 or len({len(row) for row in rows}) != 1:
         raise ValueError("needs 6 rows, each with one number per lens number of the camera")
     return rows
 
 
+_six = in_schema(minItems=6, maxItems=6)
+_four_or_more = in_schema(minItems=4)
+
 PoseCovariance = Annotated[
-    list[list[AnyNumber]], AfterValidator(lambda rows: _is_covariance(rows, 6))
+    list[Annotated[list[AnyNumber], _six]],
+    AfterValidator(lambda rows: _is_covariance(rows, 6)),
+    _six,
 ]
 """Of a pose: position [mm] and rotation about the outer frame's axes [deg], 6 x 6."""
-LensCovariance = Annotated[list[list[AnyNumber]], AfterValidator(_is_covariance_of_numbers)]
+LensMatrix = Annotated[list[Annotated[list[AnyNumber], _four_or_more]], _four_or_more]
+LensCovariance = Annotated[
+    LensMatrix, AfterValidator(lambda rows: _is_covariance(rows, max(4, len(rows))))
+]
 """Of a camera's n numbers in rig file order: fx, fy, cx, cy [px] and distortion, n x n."""
-PoseSlopes = Annotated[list[list[AnyNumber]], AfterValidator(_has_six_rows)]
+PoseSlopes = Annotated[
+    list[Annotated[list[AnyNumber], _four_or_more]], AfterValidator(_has_six_rows), _six
+]
 """Derivatives of a pose by a camera's n numbers: position [mm] and rotation [deg], 6 x n."""
 
 
@@ -169,7 +184,18 @@ class TagsDocument(Document):
 class CameraDocument(Document):
     """One camera: intrinsics (OpenCV) and pose (x right, y down, z along the view)."""
 
-    name: Name
+    model_config = ConfigDict(
+        json_schema_extra={
+            "if": {"properties": {"lens": {"const": FISHEYE}}, "required": ["lens"]},
+            "then": {
+                "properties": {"distortion": _counted(COEFFICIENTS[FISHEYE])},
+                "required": ["distortion"],
+            },
+            "else": {"properties": {"distortion": _counted(COEFFICIENTS["pinhole"])}},
+        }
+    )
+
+    name: Annotated[Name, in_schema(pattern="^[^/=.][^/=]*$")]
     width_px: Pixels
     height_px: Pixels
     fx_px: Positive
@@ -183,7 +209,7 @@ class CameraDocument(Document):
         validate_default=True,
     )
     world_from_camera: PoseDocument
-    lens_covariance: LensCovariance | None = Field(
+    lens_covariance: LensMatrix | None = Field(
         default=None,
         description="of fx_px, fy_px, cx_px, cy_px and distortion; calibrations write it",
     )
@@ -227,7 +253,11 @@ class CameraDocument(Document):
     def _one_a_number(
         cls, rows: list[list[float]] | None, info: ValidationInfo
     ) -> list[list[float]] | None:
-        count = 4 + len(info.data.get("distortion", []))
-        if rows is not None and len(rows[0]) != count:
+        if rows is None or "distortion" not in info.data:  # a wrong one has no number to compare
+            return rows
+        count = 4 + len(info.data["distortion"])
+        if info.field_name == "lens_covariance":
+            return _is_covariance(rows, count)
+        if len(rows[0]) != count:
             raise ValueError(f"needs {count} numbers per row: fx, fy, cx, cy and distortion")
         return rows

@@ -19,6 +19,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    JsonValue,
     ValidationError,
     model_validator,
 )
@@ -55,10 +56,9 @@ NAME_BYTES = 100
 """Longest name in UTF-8: it becomes part of file names."""
 
 
-def _not_too_large(value: float) -> float:
-    if abs(value) > LARGEST:
-        raise ValueError(f"must be within ±{LARGEST:g}; it is {value:g}")
-    return value
+def in_schema(**keys: JsonValue) -> Any:
+    """Keys of the JSON schema for what a validator or rule checks with a message of its own."""
+    return Field(json_schema_extra=keys)
 
 
 def _not_too_small(value: float) -> float:
@@ -75,12 +75,14 @@ def _is_name(text: str) -> str:
     return text
 
 
-_bounded = AfterValidator(_not_too_large)
-Number = Annotated[float, Field(allow_inf_nan=False), _bounded]
+Number = Annotated[float, Field(ge=-LARGEST, le=LARGEST, allow_inf_nan=False)]
 Positive = Annotated[
-    float, Field(gt=0, allow_inf_nan=False), _bounded, AfterValidator(_not_too_small)
+    float,
+    Field(gt=0, le=LARGEST, allow_inf_nan=False),
+    AfterValidator(_not_too_small),
+    in_schema(minimum=SMALLEST),
 ]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), _bounded]
+NonNegative = Annotated[float, Field(ge=0, le=LARGEST, allow_inf_nan=False)]
 AnyNumber = Annotated[float, Field(allow_inf_nan=False)]
 """Of a calibration result: intervals of what cannot be identified may be arbitrarily wide."""
 AnyNonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -99,33 +101,30 @@ def _exactly(count: int) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-_three = (Field(min_length=3, max_length=3), _exactly(3))
-Vector = Annotated[list[Number], *_three]
-PositiveVector = Annotated[list[Positive], *_three]
-NonNegativeVector = Annotated[list[NonNegative], *_three]
-Triple = Annotated[list[Annotated[int, Field(ge=-WHOLE_LARGEST, le=WHOLE_LARGEST)]], *_three]
+three = (Field(min_length=3, max_length=3), _exactly(3))
+Vector = Annotated[list[Number], *three]
+PositiveVector = Annotated[list[Positive], *three]
+NonNegativeVector = Annotated[list[NonNegative], *three]
+Triple = Annotated[list[Annotated[int, Field(ge=-WHOLE_LARGEST, le=WHOLE_LARGEST)]], *three]
 
 
-def _is_unit(quaternion: list[float]) -> list[float]:
-    norm = math.sqrt(sum(q * q for q in quaternion))
-    if abs(norm - 1.0) > 1e-6:
-        raise ValueError(f"must be a unit quaternion [w, x, y, z]; its length is {norm:.8g}")
-    return quaternion
+def _length_one(what: str) -> AfterValidator:
+    def check(vector: list[float]) -> list[float]:
+        length = math.sqrt(sum(x * x for x in vector))
+        if abs(length - 1.0) > 1e-6:
+            raise ValueError(f"must be a {what}; its length is {length:.8g}")
+        return vector
+
+    return AfterValidator(check)
 
 
 Quaternion = Annotated[
-    list[Number], Field(min_length=4, max_length=4), _exactly(4), AfterValidator(_is_unit)
+    list[Number],
+    Field(min_length=4, max_length=4),
+    _exactly(4),
+    _length_one("unit quaternion [w, x, y, z]"),
 ]
-
-
-def _has_length_one(vector: list[float]) -> list[float]:
-    length = math.sqrt(sum(x * x for x in vector))
-    if abs(length - 1.0) > 1e-6:
-        raise ValueError(f"must be a direction of length 1; its length is {length:.8g}")
-    return vector
-
-
-UnitVector = Annotated[Vector, AfterValidator(_has_length_one)]
+UnitVector = Annotated[Vector, _length_one("direction of length 1")]
 
 
 def _holds_whole(annotation: Any) -> bool:
@@ -315,7 +314,7 @@ def check_version(
         InvalidFile: With that one problem.
     """
     field, key = model.model_fields.get("schema_version"), "schema_version"
-    version = data.get(key)
+    version = _whole(data.get(key))
     if field is None or not isinstance(version, int):
         return
     (known,) = field.annotation.__args__  # type: ignore[union-attr]

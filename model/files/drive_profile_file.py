@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, JsonValue, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
-from model.files.documents import Document, Finding
+from model.files.documents import Document, Finding, in_schema
 
 OBJECTS: Mapping[str, str] = {
     "1006h:00": "communication cycle period",
@@ -112,19 +112,14 @@ def _is_code(text: str) -> str:
     return text
 
 
-def _in_schema(**keys: JsonValue) -> Any:
-    """Keys of the JSON schema for what a validator checks with a message of its own."""
-    return Field(json_schema_extra=keys)
-
-
-ObjectName = Annotated[str, AfterValidator(_is_object), _in_schema(pattern=f"^{_OBJECT.pattern}$")]
-KnownObject = Annotated[str, AfterValidator(_is_known), _in_schema(enum=[*OBJECTS])]
+ObjectName = Annotated[str, AfterValidator(_is_object), in_schema(pattern=f"^{_OBJECT.pattern}$")]
+KnownObject = Annotated[str, AfterValidator(_is_known), in_schema(enum=[*OBJECTS])]
 MissingObject = Annotated[
-    str, AfterValidator(_is_known), _in_schema(enum=[key for key in OBJECTS if key not in NEEDED])
+    str, AfterValidator(_is_known), in_schema(enum=[key for key in OBJECTS if key not in NEEDED])
 ]
-CodePattern = Annotated[str, AfterValidator(_is_code), _in_schema(pattern=f"^{_CODE.pattern}$")]
+CodePattern = Annotated[str, AfterValidator(_is_code), in_schema(pattern=f"^{_CODE.pattern}$")]
 RatedValue = Annotated[
-    float, Field(le=1e9), AfterValidator(_is_fine), _in_schema(minimum=FINEST_RATED)
+    float, Field(le=1e9), AfterValidator(_is_fine), in_schema(minimum=FINEST_RATED)
 ]
 Text = Annotated[str, Field(min_length=1)]
 

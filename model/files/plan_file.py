@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast
 
-from pydantic import Field
+from pydantic import ConfigDict, Field
+from pydantic.config import JsonDict
 
 from model.files.documents import (
     COUNT_LARGEST,
@@ -118,8 +119,15 @@ class StopMarkDocument(Document):
     waypoint: Annotated[int, Field(ge=0, le=WHOLE_LARGEST)]
 
 
+def _require_kind(schema: JsonDict) -> None:
+    """Files need `kind` as well; its default only keeps it out of hashes."""
+    schema["required"] = ["kind", *cast("list[str]", schema["required"])]
+
+
 class PlanDocument(Document):
     """A path from start to goal; `hash` covers everything else in the file."""
+
+    model_config = ConfigDict(json_schema_extra=_require_kind)
 
     kind: Literal["cdpr-plan"] = "cdpr-plan"
     schema_version: Literal[1]

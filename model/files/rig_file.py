@@ -20,6 +20,7 @@ from model.files.documents import (
     PositiveVector,
     UnitVector,
     Vector,
+    in_schema,
 )
 from model.files.simulation_file import SimulationDocument
 
@@ -31,13 +32,20 @@ Identity = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 FileName = Annotated[str, Field(min_length=1)]
 
 
+STIFFEST_N = 1e9
+"""More than any cable's; 80 mm of steel wire rope has 3e8 N."""
+
+
 def _in_newtons(stiffness: float) -> float:
-    if stiffness > 1e9:  # 80 mm of steel wire rope has 3e8 N
+    if stiffness > STIFFEST_N:
         raise ValueError(f"must be E·A in N, at most 1e9; {stiffness:g} may be E in Pa")
     return stiffness
 
 
-Stiffness = Annotated[Positive, AfterValidator(_in_newtons)]
+Stiffness = Annotated[Positive, AfterValidator(_in_newtons), in_schema(maximum=STIFFEST_N)]
+
+FEWEST_CABLES = 6
+_one_a_cable = (Field(min_length=1), in_schema(minItems=FEWEST_CABLES))
 
 ODRIVE_LAST_NODE = 62
 """Of six bits; 63 is an ODrive without a node id."""
@@ -140,7 +148,7 @@ class PulleysDocument(Document):
     radius_mm: Positive = Field(
         description="to the cable's centre line: radius of the bare groove plus that of the cable"
     )
-    feed_directions: Annotated[list[UnitVector], Field(min_length=1)] = Field(
+    feed_directions: Annotated[list[UnitVector], *_one_a_cable] = Field(
         description="per cable: unit direction of travel of the cable where it enters the pulley,"
         " along the swivel axis"
     )
@@ -222,8 +230,8 @@ class RigDocument(Document):
     description: str = ""
     platform: PlatformDocument
     workspace: WorkspaceDocument
-    outlets_mm: Annotated[list[Vector], Field(min_length=1)]
-    anchors_mm: Annotated[list[Vector], Field(min_length=1)]
+    outlets_mm: Annotated[list[Vector], *_one_a_cable]
+    anchors_mm: Annotated[list[Vector], *_one_a_cable]
     outlets_error_mm: NonNegative | None = Field(
         default=None, description="position error of any of them, 95 %; calibrations write it"
     )
@@ -232,7 +240,7 @@ class RigDocument(Document):
     )
     cables: CableDocument
     pulleys: PulleysDocument | None = None
-    winches: Annotated[list[WinchDocument], Field(min_length=1)]
+    winches: Annotated[list[WinchDocument], *_one_a_cable]
     motion: MotionDocument = MotionDocument()
     bus: BusDocument
     drives: DrivesDocument = Cia402Document(type="cia402")
@@ -264,7 +272,7 @@ class RigDocument(Document):
     def _enough_cables(self) -> list[Finding]:
         m = len(self.outlets_mm)
         what = f"{m} outlets: a platform with six degrees of freedom needs 6 or more"
-        return [(("outlets_mm",), what)] if m < 6 else []
+        return [(("outlets_mm",), what)] if m < FEWEST_CABLES else []
 
     def _an_anchor_each(self) -> list[Finding]:
         return self._one_each(("anchors_mm",), len(self.anchors_mm))

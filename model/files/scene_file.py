@@ -9,7 +9,7 @@ from itertools import accumulate
 from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field
 
 from model.files.documents import (
     Document,
@@ -17,14 +17,16 @@ from model.files.documents import (
     Name,
     NonNegative,
     NonNegativeVector,
+    Number,
     PoseDocument,
     Positive,
-    PositiveVector,
     Quaternion,
     Triple,
     Vector,
+    in_schema,
+    three,
 )
-from model.pose import RotationLimits
+from model.pose import Array, RotationLimits
 
 # The payload of the platform, and its changes at picks and places.
 #
@@ -91,6 +93,19 @@ class Payload:
 
 class StopDocument(PoseDocument):
     """A pose between start and goal, with dwell and change of load."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "if": {"properties": {"kind": {"const": "pass"}}},
+            "then": {
+                "properties": {"mass_kg": {"type": "null"}, "mass_centre_mm": {"type": "null"}}
+            },
+            "else": {
+                "properties": {"dwell_s": {"exclusiveMinimum": 0}, "mass_kg": {"type": "number"}},
+                "required": ["dwell_s", "mass_kg"],
+            },
+        }
+    )
 
     name: Name
     kind: Literal["pass", "pick", "place"] = "pass"
@@ -170,36 +185,40 @@ SMALL_OBSTACLE_MM, SMALL_CLEARANCE_MM = 10.0, 0.5
 
 SHAPES = ("box", "sphere", "cylinder", "capsule", "convex", "mesh")
 
+Coordinate = Annotated[Number, in_schema(minimum=-FARTHEST_MM, maximum=FARTHEST_MM)]
+Corner = Annotated[list[Coordinate], *three]
+Length = Annotated[Positive, in_schema(maximum=FARTHEST_MM)]
+
 
 class BoxDocument(Document):
     """A box about its centre."""
 
-    size_mm: PositiveVector
+    size_mm: Annotated[list[Length], *three]
 
 
 class SphereDocument(Document):
     """A ball about its centre."""
 
-    radius_mm: Positive
+    radius_mm: Length
 
 
 class RoundDocument(Document):
     """A cylinder (length between its flat ends) or a capsule (length of its axis), along z."""
 
-    radius_mm: Positive
-    length_mm: Positive
+    radius_mm: Length
+    length_mm: Length
 
 
 class HullDocument(Document):
     """The convex hull of points."""
 
-    points_mm: Annotated[list[Vector], Field(min_length=4)]
+    points_mm: Annotated[list[Corner], Field(min_length=4)]
 
 
 class MeshDocument(Document):
     """A surface of triangles; each triangle names three points, counted from 0."""
 
-    points_mm: Annotated[list[Vector], Field(min_length=3)]
+    points_mm: Annotated[list[Corner], Field(min_length=3)]
     triangles: Annotated[list[Triple], Field(min_length=1)]
 
 
@@ -209,8 +228,14 @@ ShapeDocument = BoxDocument | SphereDocument | RoundDocument | HullDocument | Me
 class ObstacleDocument(Document):
     """One obstacle: a name, exactly one shape, and its pose."""
 
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"properties": {k: {"type": "object"}}, "required": [k]} for k in SHAPES]
+        }
+    )
+
     name: Name
-    position_mm: Vector = [0.0, 0.0, 0.0]
+    position_mm: Corner = [0.0, 0.0, 0.0]
     rotation_wxyz: Quaternion = [1.0, 0.0, 0.0, 0.0]
     box: BoxDocument | None = None
     sphere: SphereDocument | None = None
@@ -345,7 +370,7 @@ class SceneDocument(Document):
     def _within_reach(self) -> list[Finding]:
         found: list[Finding] = []
         for i, obstacle in enumerate(self.obstacles):
-            largest = max(abs(number) for number in _numbers(obstacle))
+            largest = np.abs(_numbers(obstacle)).max()
             if largest > FARTHEST_MM:
                 what = (
                     f"obstacle {obstacle.name!r} reaches {largest:g} mm; distances are proved up"
@@ -384,20 +409,13 @@ class SceneDocument(Document):
         return found
 
 
-def _numbers(obstacle: ObstacleDocument) -> list[float]:
+def _numbers(obstacle: ObstacleDocument) -> Array:
     """All lengths and coordinates of an obstacle, [mm]."""
-    numbers = list(obstacle.position_mm)
-    if obstacle.box is not None:
-        numbers += obstacle.box.size_mm
-    if obstacle.sphere is not None:
-        numbers.append(obstacle.sphere.radius_mm)
-    for tube in (obstacle.cylinder, obstacle.capsule):
-        if tube is not None:
-            numbers += [tube.radius_mm, tube.length_mm]
-    for cloud in (obstacle.convex, obstacle.mesh):
-        if cloud is not None:
-            numbers += [value for point in cloud.points_mm for value in point]
-    return numbers
+    lengths = [
+        np.ravel([value for key, value in shape if key != "triangles"])
+        for shape in obstacle.shapes().values()
+    ]
+    return np.hstack([obstacle.position_mm, *lengths])
 
 
 def _extent(obstacle: ObstacleDocument) -> float:

@@ -113,7 +113,7 @@ class TensionInfeasible(Refused):
 
 def remedy(at_largest: tuple[int, ...], at_smallest: tuple[int, ...]) -> str:
     """What to change where these cables' limits keep tensions from balancing a wrench."""
-    if not at_largest:  # as of a light platform below all its outlets
+    if not at_largest:  # such as those of a light platform below all its outlets
         return "lower the smallest tensions, add weight"
     if not at_smallest:
         return "lower the load, raise the largest tensions"

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import yaml
 
+import calibration
 import cdpr
 from executor.cameras.sources import choose_camera
 from executor.jogging import jog_cable
@@ -448,6 +449,17 @@ def test_arguments_that_contradict_each_other_are_refused(rig: cdpr.Rig, scene: 
         (lambda *_: cdpr.calibrate_rig("r.yaml", []), "a Rig", "cdpr.load_rig('r.yaml')"),
         (lambda *_: cdpr.locate_camera("r.yaml", 0), "a Rig", "cdpr.load_rig('r.yaml')"),
         (lambda *_: cdpr.locate_tags("r.yaml", 0), "a Rig", "cdpr.load_rig('r.yaml')"),
+        (lambda *_: calibration.measure_readout("r.yaml", "v.mp4"), "a Rig", "cdpr.load_rig("),
+        (
+            lambda *_: calibration.locate_camera_by_another("r.yaml", "a", "b", reference="side"),
+            "a Rig",
+            "cdpr.load_rig('r.yaml')",
+        ),
+        (
+            lambda *_: calibration.compare("first.yaml", "second.yaml"),
+            "a ResultDocument, not text",
+            "cdpr.load_calibration('first.yaml')",
+        ),
         (lambda rig, _: cdpr.measurement_poses(rig, "s.yaml"), "a Scene", "load_scene('s.yaml')"),
     ],
 )
@@ -488,6 +500,10 @@ def test_a_number_that_cannot_be_is_refused_before_anything_is_read(
         "wanted must be": partial(cdpr.calibrate_camera, "absent", board, wanted=number),
         "wanted must": partial(cdpr.locate_camera, rig, "absent", wanted=number),
         "wanted mus": partial(cdpr.locate_tags, rig, "absent", wanted=number),
+        "wanted mu": partial(calibration.measure_readout, rig, "absent", wanted=number),
+        "wanted m": partial(
+            calibration.locate_camera_by_another, rig, "a", "b", reference="side", wanted=number
+        ),
         "dwell must be": partial(cdpr.measurement_poses, rig, scene, dwell=number),
         "tilt must b": partial(cdpr.measurement_poses, rig, scene, tilt=number),
     }.items():
@@ -506,6 +522,8 @@ def test_a_number_that_cannot_be_is_refused_before_anything_is_read(
         lambda rig: cdpr.locate_camera(rig, "absent", poses=""),
         lambda rig: cdpr.calibrate_camera("", cdpr.Chessboard(9, 6, 0.02)),
         lambda rig: cdpr.calibrate_camera(".", cdpr.Chessboard(9, 6, 0.02), output=""),
+        lambda rig: calibration.measure_readout(rig, ""),
+        lambda _: calibration.calibrate_camera_from_corners("", (1280, 720)),
         lambda rig: cdpr.calibrate_rig(rig, ""),
         lambda rig: cdpr.calibrate_rig(rig, [""]),
         lambda rig: cdpr.home(rig, camera=""),
@@ -550,6 +568,22 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
             return lambda _, scene, x: scene.changed(**{argument: x})
         case "calibrate_rig" | "locate_camera" | "locate_tags" | "track":
             return lambda rig, _, x: getattr(cdpr, verb)(rig, "absent", **{argument: x})
+        case "measure_readout":
+            return lambda rig, _, x: calibration.measure_readout(
+                rig, **{"source": "absent", argument: x}
+            )
+        case "locate_camera_by_another":
+            quick = {"source": "a", "reference_source": "b", "reference": "front"}
+            return lambda rig, _, x: calibration.locate_camera_by_another(
+                rig, **{**quick, argument: x}
+            )
+        case "calibrate_camera_from_corners":
+            quick = {"corners": "absent", "size": (1280, 720)}
+            return lambda *given: calibration.calibrate_camera_from_corners(
+                **{**quick, argument: given[-1]}
+            )
+        case "compare":
+            return lambda *given: calibration.compare(given[-1], given[-1])
         case "calibrate_camera":
             board = cdpr.Chessboard(9, 6, 0.02)
             return lambda *given: cdpr.calibrate_camera("absent", board, **{argument: given[-1]})
@@ -598,7 +632,14 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
         *("changed start", "changed goal", "changed clearance"),
         *("calibrate_rig " + name for name in (*NUMBERS_OF_A_FIT, "deviations")),
         *("calibrate_rig pose_deviations", "calibrate_rig reflector"),
-        *("calibrate_camera wanted", "calibrate_camera distance"),
+        *("calibrate_camera " + name for name in ("wanted", "distance", "lens", "name")),
+        *("measure_readout " + name for name in ("source", "camera", "rate", "speed", "wanted")),
+        *(
+            "locate_camera_by_another " + name
+            for name in ("source", "camera", "reference", "board")
+        ),
+        *("calibrate_camera_from_corners " + name for name in ("corners", "size", "name", "lens")),
+        "compare",
         *("locate_camera wanted", "locate_tags wanted", "track pictures", "track overlay"),
         *("measurement_poses " + name for name in ("tilt", "turn", "dwell")),
         *("home " + name for name in ("tension", "limit", "reach", "speed", "pictures")),

@@ -58,7 +58,7 @@ def film(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: Path) -> None:
-    made = measure_readout(rig, rig.cameras[0], film, rate=RATE)
+    made = measure_readout(rig, film, rate=RATE)
     found = made.found
     twice = {f"{name}, tag 3": "is detected more than once" for name in found.speeds}
     page = readout_page(replace(found, unused={**twice, "x": "no pose"}), made.quality, "today")
@@ -74,14 +74,14 @@ def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: P
 
 def test_a_camera_that_exposes_all_rows_at_once_has_none(rig: Rig, tmp_path: Path) -> None:
     write_film(rig, tmp_path, 0.0, 12)
-    found = measure_readout(rig, rig.cameras[0], tmp_path, rate=RATE).found
+    found = measure_readout(rig, tmp_path, rate=RATE).found
     assert abs(found.readout) < max(found.half_width, 5e-4)
 
 
 def test_a_platform_at_rest_shows_no_readout(rig: Rig, tmp_path: Path) -> None:
     write_film(rig, tmp_path, TRUE, 8, still=True)
     with pytest.raises(BadInput, match="do not determine it"):
-        measure_readout(rig, rig.cameras[0], tmp_path, rate=RATE)
+        measure_readout(rig, tmp_path, rate=RATE)
 
 
 def test_the_verb_writes_a_result_that_applies_to_the_rig(film: Path, tmp_path: Path) -> None:

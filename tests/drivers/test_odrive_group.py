@@ -597,7 +597,7 @@ REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]]
     "firmware 0.5": (
         lambda b: setattr(b.drives[1], "_answer", lambda _command: None),
         HardwareMissing,
-        r"drive 2: heartbeats, but no Get_Version(.|\n)*firmware 0\.5, as of every ODrive 3\.x",
+        r"drive 2: heartbeats, but no Get_Version(.|\n)*firmware 0\.5, which every ODrive 3\.x has",
     ),
     "neither version nor heartbeat": (
         lambda b: (

@@ -242,6 +242,13 @@ def test_json_that_is_not_a_plan_is_reported_in_one_sentence(text: str, tmp_path
     assert refused(text, tmp_path).what == "this is not a plan file"
 
 
+def test_a_plan_without_its_kind_is_refused_by_schema_and_program(tmp_path: Path) -> None:
+    """The hash leaves it out as a default; the file must not."""
+    assert "kind" in PlanDocument.model_json_schema()["required"]
+    without = {key: value for key, value in DATA.items() if key != "kind"}
+    assert refused(json.dumps(without), tmp_path).why == "its key `kind` must be `cdpr-plan`"
+
+
 def test_a_plan_of_another_version_is_reported_as_that_alone(tmp_path: Path) -> None:
     """Whatever else the other version has: its keys are not mistakes."""
     error = refused(json.dumps({**DATA, "schema_version": 2, "newer": 1}), tmp_path)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import json
 import re
 import subprocess
 import sys
+from dataclasses import fields, is_dataclass
 from html.parser import HTMLParser
 from pathlib import Path
 from shutil import which
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -22,6 +25,7 @@ from drivers.can_load import bus_load
 from executor.control.winch_laws import MOST_RESERVE, RESERVE, RESERVE_COUNTS, CableStep
 from executor.jogging import LONGEST_MM, SPEED
 from executor.winch_runs import limit_of
+from model.cameras import Camera, Tag
 from model.errors import BadInput, Fault, HardwareMissing, Refused
 from model.files.examples import rig_text
 from model.files.new_rig import AFTER_COORDINATES, BEFORE_COORDINATES, collect_answers
@@ -29,9 +33,10 @@ from model.files.plan_file import PlanDocument
 from model.files.rig_file import CableDocument, PlatformDocument, RigDocument, WinchDocument
 from model.files.scene_file import SceneDocument
 from model.files.validation import parse_yaml
-from model.rig import load_rig, rig_from_document
+from model.rig import Motion, Winch, load_rig, rig_from_document
 from model.statics.gravity import STANDARD_GRAVITY
 from planner.anytime import path as anytime_path
+from tests.api.test_names import PACKAGES
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = re.compile(r"^\s*(https?:)?//", re.IGNORECASE)
@@ -266,3 +271,31 @@ OURS = re.compile(
 def test_every_file_that_a_page_names_is_there(page: str | Path) -> None:
     named = set(OURS.findall((ROOT / page).read_text("utf-8")))
     assert sorted(name for name in named if not (ROOT / name).exists()) == []
+
+
+PUBLIC = [
+    getattr(module, name)
+    for module in map(importlib.import_module, PACKAGES)
+    for name in module.__all__
+]
+CLASSES: dict[str, Any] = {
+    each.__name__: each
+    for each in (*PUBLIC, Camera, Motion, Tag, Winch)
+    if isinstance(each, type) and is_dataclass(each)
+}
+
+
+def listed_attributes(owner: type) -> list[str]:
+    """Names in the section `Attributes:` of a docstring, in its order."""
+    _, _, section = inspect.cleandoc(owner.__doc__ or "").partition("Attributes:\n")
+    return re.findall(r"^    (\w+):", section.partition("\n\n")[0], re.MULTILINE)
+
+
+@pytest.mark.parametrize("name", sorted(CLASSES))
+def test_the_attributes_of_a_public_class_are_its_fields(name: str) -> None:
+    """The API pages print this list; editors show it."""
+    owner = CLASSES[name]
+    passed_on = {"proof"}  # only by the function that proves the object
+    names = {field.name for field in fields(owner) if not field.name.startswith("_")}
+    listed = [name for part in owner.__mro__ for name in listed_attributes(part)]
+    assert sorted(listed) == sorted(names - passed_on)

@@ -141,8 +141,8 @@ def readout(
     the_rig = calibrated_rig(load_rig(rig), calibration)
     made = measure_readout(
         the_rig,
-        the_rig.camera(camera),
         source,
+        camera=camera,
         rate=rate_hz,
         speed=None if speed_mm_s is None else speed_mm_s / 1e3,
         wanted=wanted_mm / 1e3,
@@ -192,7 +192,6 @@ def extrinsics(
       cdpr calibrate extrinsics rig.yaml side/ --camera side --beside front=front/
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
-    the_camera = the_rig.camera(camera)
     if beside is not None:
         if poses is not None:
             raise BadInput(
@@ -203,9 +202,10 @@ def extrinsics(
         another, other = parse_named_source(the_rig, beside, "--beside")
         made = locate_camera_by_another(
             the_rig,
-            the_camera,
-            another,
-            (source, other),
+            source,
+            other,
+            camera=camera,
+            reference=another.name,
             board=printed.made() if printed != BoardOptions() else None,
             pictures=pictures,
             wanted=wanted_mm / 1e3,

@@ -1,4 +1,4 @@
-"""F1–F28: faults during motion; all drives stop in time, together, and stay stopped."""
+"""F1–F28, without F15 and F22: faults during motion; all drives stop together and stay stopped."""
 
 from __future__ import annotations
 
