@@ -21,11 +21,12 @@ from tracking.detection.detector import (
     region_around,
 )
 from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored
-from tracking.estimator import CAUSE, PlatformEstimator, TrackerSettings
+from tracking.estimator import CAUSE, UNEVEN, PlatformEstimator
 from tracking.measurement import (
     NoPose,
     Observation,
     PoseMeasurement,
+    TrackerSettings,
     largest_deviations,
     predict,
 )
@@ -198,8 +199,10 @@ class Tracker:
             )
         if self._failed is not None:
             result = NoPose(time, self._suspicion(self._failed[1]))
-        if isinstance(result, NoPose) and CAUSE in result.reason and self._is_uncorrected(time):
-            result = replace(result, reason=result.reason.replace(CAUSE, f"{CAUSE}, {MOVING}"))
+        if isinstance(result, NoPose) and self._is_uncorrected(time):
+            for cause in (CAUSE, UNEVEN):
+                reason = result.reason.replace(cause, f"{cause}, {MOVING}")
+                result = replace(result, reason=reason)
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result

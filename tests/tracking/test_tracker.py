@@ -26,8 +26,7 @@ from tracking.camera_model import Image, pixels_of
 from tracking.detection.detector import Detection, TagDetector
 from tracking.detection.diagnostics import are_mirrored, diagnose_tags
 from tracking.detection.tags import alike_in_mirror, dictionary
-from tracking.estimator import TrackerSettings
-from tracking.measurement import NoPose, PoseMeasurement
+from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings
 from tracking.shared_errors import CameraMoved
 from tracking.tracker import Tracker
 
