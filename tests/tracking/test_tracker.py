@@ -249,8 +249,12 @@ def test_a_camera_moved_during_a_run_is_noticed(
     tracker = Tracker(rig, camera, TrackerSettings(camera_check_period=2))
     truth = Pose.level([0.0, 0.0, 0.445])
     assert isinstance(tracker.observe(synthetic.render(truth, 0), 0.0), PoseMeasurement)
-    with pytest.raises(CameraMoved):
+    with pytest.raises(CameraMoved) as caught:
         list(tracker.observe(later.render(truth, frame), frame * 0.1) for frame in range(1, 4))
+    assert caught.value.why.endswith(
+        "image 1, at 0.000 s, was the last to pass this check, so poses measured after it are"
+        " doubtful"
+    )
 
 
 def test_another_print_of_a_covered_frame_tag_costs_one_pose_and_not_the_camera(
