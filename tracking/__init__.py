@@ -8,9 +8,8 @@ from model.lazy import lazy_names
 
 if TYPE_CHECKING:
     from tracking.clearance import MeasuredClearance, clearance_of
-    from tracking.estimator import TrackerSettings
     from tracking.fusion import MultiCameraFusion
-    from tracking.measurement import NoPose, PoseMeasurement
+    from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings
     from tracking.pose_log import write_pose_log
     from tracking.shared_errors import CameraMoved
     from tracking.tracker import Tracker
@@ -32,9 +31,8 @@ if not TYPE_CHECKING:
         __name__,
         {
             "tracking.clearance": "MeasuredClearance clearance_of",
-            "tracking.estimator": "TrackerSettings",
             "tracking.fusion": "MultiCameraFusion",
-            "tracking.measurement": "NoPose PoseMeasurement",
+            "tracking.measurement": "NoPose PoseMeasurement TrackerSettings",
             "tracking.pose_log": "write_pose_log",
             "tracking.shared_errors": "CameraMoved",
             "tracking.tracker": "Tracker",

@@ -21,50 +21,23 @@ from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
 from tracking.detection.tags import carries_tag, modules_across, tag_corners, view_angle
 from tracking.edges.refine import refine
-from tracking.measurement import MOST_TURN, NoPose, Observation, PoseMeasurement, largest_deviations
-from tracking.pnp import BundlePose, TagView, displaced_tag, fit_inliers, solve_pnp, square_poses
+from tracking.measurement import (
+    NoPose,
+    Observation,
+    PoseMeasurement,
+    TrackerSettings,
+    largest_deviations,
+)
+from tracking.pnp import (
+    BundlePose,
+    TagView,
+    fit_inliers,
+    scatter_without_one,
+    solve_pnp,
+    square_poses,
+)
 from tracking.rolling_shutter import FitByRows, RecentMotion, RollingShutter
-from tracking.shared_errors import SharedErrors
-
-
-@dataclass(frozen=True, slots=True)
-class TrackerSettings:
-    """Acceptance limits of a pose, and the camera check.
-
-    Attributes:
-        reprojection_px: Largest RMS error of the corners in the image, beside that from the stated
-            error of the tags.
-        view_angle: Largest angle between line of sight and a tag's normal, [rad].
-        position_deviation: Largest standard deviation of the position along any direction, [m].
-        jump: Largest distance from the last pose beyond what `speed` allows, [m].
-        jump_angle: Largest rotation from the last pose, [rad].
-        speed: Largest expected speed of the platform, [m/s]; 1.5 times the rig's if that is more.
-        turn: Largest rotation from the home pose, [rad].
-        single_tag_margin: Required cost difference to the mirror pose, in variances, of the pose of
-            a single tag, or of several in one plane.
-        contradiction: Largest misfit of the edges: their mean squared error, in variances of edges
-            and of the tags' error. In good images it is about 1.
-        doubt: The same where more than `left_out_share` of the edges were left out.
-        left_out_share: Share of edges that may be left out, [1].
-        camera_moved_px: Error of frame tags in the image above which the camera counts as moved,
-            beside that from the stated error of its pose.
-        camera_check_period: Images between checks of the camera.
-    """
-
-    reprojection_px: float = 0.5
-    view_angle: float = float(np.radians(76.0))
-    position_deviation: float = 0.003
-    jump: float = 0.03
-    jump_angle: float = 0.25
-    speed: float = 0.2
-    turn: float = MOST_TURN
-    single_tag_margin: float = 30.0
-    contradiction: float = 7.0
-    doubt: float = 2.0
-    left_out_share: float = 0.25
-    camera_moved_px: float = 1.0
-    camera_check_period: int = 10
-
+from tracking.shared_errors import SharedErrors, displaced_tag
 
 # Consensus: which detected squares belong to the body.
 
@@ -146,7 +119,7 @@ LIKELY_TAG_ERROR = 5e-5
 """Standard deviation of a tag's corners on the platform, where none is stated, [m]."""
 UNCERTAIN = "the position's uncertainty is"
 """Message about a pose from edges that are too soft, too few or too far away."""
-UNSHARP = "are too blurred to be measured"
+UNSHARP = "cannot be measured: they are too blurred, or something lies along them"
 """Message about tags that are decoded, but whose edges are not found."""
 ROTATED = "from the home pose, the limit is"
 """Message about a platform that is rotated too far to be measured."""
@@ -157,6 +130,11 @@ CAUSE = (
     " file"
 )
 """Likely cause of it."""
+UNEVEN = (
+    "look for something along an edge, a margin cut off, a bent or smudged print, or a wrong lens"
+    " calibration"
+)
+"""Likely cause of edges of one tag that do not fit each other: its size, id and pose are not."""
 
 
 def rejection_reason(
@@ -179,19 +157,21 @@ def rejection_reason(
         expected: Squared error of an edge with that of the tags on the platform, in variances.
         elsewhere: Numbers of tags on the platform that are not where the pose puts them.
     """
-    used = ", ".join(str(view.tag.id) for view in views)
+    used, edges = ", ".join(str(view.tag.id) for view in views), _edges(views)
     if len(elsewhere) >= len(views):
         others = ", ".join(map(str, elsewhere))
         return f"{CONTRADICT}: {others} against {used}; {CAUSE}"
-    left_out = measured - sum(int(view.seen.edges.sum()) for view in views)
+    if bundle.freedom == 0:
+        return f"only {edges} edges of tags {used} are measured: any three fit a pose exactly"
+    left_out = measured - edges
     misfit = bundle.cost / max(1, bundle.freedom) / expected
     some_left_out = left_out > limits.left_out_share * measured
     if misfit > (limits.doubt if some_left_out else limits.contradiction):
         out = f", with {left_out} of {measured} left out" if left_out else ""
-        return (
-            f"{CONTRADICT}: the misfit of their edges is {misfit:.0f} times the expected one{out};"
-            f" {CAUSE}"
-        )
+        what, cause = (f"{CONTRADICT}: the misfit of their edges", CAUSE)
+        if len(views) == 1 and not elsewhere:
+            what, cause = f"the edges of tag {used} form no square: their misfit", UNEVEN
+        return f"{what} is {misfit:.0f} times the expected one{out}; {cause}"
     if bundle.reprojection > limits.reprojection_px:
         limit = f"the limit is {limits.reprojection_px:g} px"
         return f"the reprojection error is {bundle.reprojection:.2f} px, {limit}"
@@ -201,11 +181,19 @@ def rejection_reason(
         return f"only {alone} detected, which allows two poses"
     largest, _ = largest_deviations(bundle.covariance)
     if not largest <= limits.position_deviation:
+        doubt = ""
+        if bundle.without_one.any():
+            doubt = f"one of the four edges of tags {used} is wrong, and any may be it: "
         return (
-            f"{UNCERTAIN} {largest * 1e3:.1f} mm,"
+            f"{doubt}{UNCERTAIN} {largest * 1e3:.1f} mm,"
             f" the limit is {limits.position_deviation * 1e3:g} mm"
         )
     return ""
+
+
+def _edges(views: Sequence[TagView]) -> int:
+    """Number of measured edges."""
+    return sum(int(view.seen.edges.sum()) for view in views)
 
 
 class PlatformEstimator:
@@ -304,7 +292,7 @@ class PlatformEstimator:
         if fitted is None:
             return NoPose(time, self._no_fit_reason(views, start), seen)
         faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
-        edges = sum(int(view.seen.edges.sum()) for view in faced)
+        edges = _edges(faced)
         views, bundle = fitted
         stated = (self._rig.tag_error or 0.0) * self._scale(bundle)
         reprojection = math.hypot(self._settings.reprojection_px, stated)
@@ -427,7 +415,9 @@ class PlatformEstimator:
             pose, limit = fitted[1].camera_from_body, self._expected_error(fitted[1])
             worst = displaced_tag(self._camera, views, pose, limit, self._settings.contradiction)
             if worst is None or len(views) == 1:
-                return fitted[0], replace(fitted[1], displaced=displaced)
+                views, bundle = fitted
+                spread = scatter_without_one(bundle, self._shared.expected_cost(bundle, views))
+                return views, replace(bundle, displaced=displaced, without_one=spread)
             views = [view for view in views if view is not worst]
             displaced += (worst.tag.id,)
         return None

@@ -20,6 +20,45 @@ MOST_TURN = math.radians(80.0)
 """Largest rotation from the home pose that is measured; wrong poses are mostly beyond it."""
 
 
+@dataclass(frozen=True, slots=True)
+class TrackerSettings:
+    """Acceptance limits of a pose, and the camera check.
+
+    Attributes:
+        reprojection_px: Largest RMS error of the corners in the image, beside that from the stated
+            error of the tags.
+        view_angle: Largest angle between line of sight and a tag's normal, [rad].
+        position_deviation: Largest standard deviation of the position along any direction, [m].
+        jump: Largest distance from the last pose beyond what `speed` allows, [m].
+        jump_angle: Largest rotation from the last pose, [rad].
+        speed: Largest expected speed of the platform, [m/s]; 1.5 times the rig's if that is more.
+        turn: Largest rotation from the home pose, [rad].
+        single_tag_margin: Required cost difference to the mirror pose, in variances, of the pose of
+            a single tag, or of several in one plane.
+        contradiction: Largest misfit of the edges: their mean squared error, in variances of edges
+            and of the tags' error. In good images it is about 1.
+        doubt: The same where more than `left_out_share` of the edges were left out.
+        left_out_share: Share of edges that may be left out, [1].
+        camera_moved_px: Error of frame tags in the image above which the camera counts as moved,
+            beside that from the stated error of its pose.
+        camera_check_period: Images between checks of the camera.
+    """
+
+    reprojection_px: float = 0.5
+    view_angle: float = float(np.radians(76.0))
+    position_deviation: float = 0.003
+    jump: float = 0.03
+    jump_angle: float = 0.25
+    speed: float = 0.2
+    turn: float = MOST_TURN
+    single_tag_margin: float = 30.0
+    contradiction: float = 7.0
+    doubt: float = 2.0
+    left_out_share: float = 0.25
+    camera_moved_px: float = 1.0
+    camera_check_period: int = 10
+
+
 def largest_deviations(covariance: Array) -> tuple[float, float]:
     """Standard deviations of position [m] and rotation [rad] along their worst directions.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import cv2
@@ -40,6 +40,9 @@ PRIOR_WEIGHT = 12.0
 CHANCE, FEWEST = 1.3, 4
 #: Coverage of the intervals.
 COVERAGE = 0.95
+#: With four edges in all, one of them is taken to be wrong if the cost exceeds the expected one by
+#: this factor: the 99.9 % quantile of a chi-squared variable with two degrees of freedom.
+ONE_WRONG = 6.9
 #: Two results closer than this are the same, [m] and [rad].
 SAME = (2e-3, 0.02)
 #: Tags are in one plane if their scatter along its normal is below this share of that across it.
@@ -63,24 +66,28 @@ class BundlePose:
     Attributes:
         squares: The tags.
         camera_from_body: The pose.
-        covariance: Of position [m] and rotation vector [rad] along the camera's axes, shape (6, 6).
+        stated: Covariance of position [m] and rotation vector [rad] along the camera's axes, shape
+            (6, 6), from the stated deviations of the edges.
         cost: Huber cost of the edges, in variances.
         second_best_cost: Cost of the second-best, or mirror, pose; infinite without one.
         freedom: Degrees of freedom: edge errors minus six.
         edge_errors: Of each tag's edges, in deviations, 0 where hidden, shape (t, 4).
         displaced: Numbers of tags left out because they are not where the pose puts them.
         second_best: The second-best pose, if there is one.
+        without_one: Scatter of the poses without one edge each about this one, shape (6, 6), if
+            one of four edges in all is wrong; else 0.
     """
 
     squares: Squares
     camera_from_body: Pose
-    covariance: Array
+    stated: Array
     cost: float
     second_best_cost: float
     freedom: int
     edge_errors: Array
     displaced: tuple[int, ...] = ()
     second_best: Pose | None = None
+    without_one: Array = field(default_factory=lambda: np.zeros((6, 6)))
 
     def is_expected(self, prior: Pose | None) -> bool:
         """Whether a prior of the pose decides for it, and against the second-best one."""
@@ -103,6 +110,20 @@ class BundlePose:
             return usual
         factor = stdtrit(max(expected, FEWEST), 0.5 + COVERAGE / 2.0) / Z_95
         return max(usual, self.cost / max(expected, 1.0) * float(factor) ** 2)
+
+    def covariance_if(self, expected: float) -> Array:
+        """Covariance of the pose, shape (6, 6), widened by the misfit of its edges.
+
+        Args:
+            expected: The expected cost, `freedom` or more.
+        """
+        factor = min(self.misfit(self.freedom), max(self.misfit(expected), 1.0))
+        return read_only(factor * self.stated + self.without_one)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance of position [m] and rotation vector [rad], camera axes, shape (6, 6)."""
+        return self.covariance_if(self.freedom)
 
     # In the image: pixels of the fit are undistorted, and larger off the axis of a wide lens.
 
@@ -275,20 +296,22 @@ def square_poses(camera: Camera, view: TagView) -> list[Pose]:
     return poses
 
 
-# Outlier edges and displaced tags.
+# Outlier edges.
 
 
 #: An edge is an outlier if its error exceeds this many times the median error.
 FAR = 4.5
-#: An intact square is elsewhere if the error of an edge exceeds this many expected deviations. A
-#: rolling shutter in unknown motion causes 9 of them, a size that is 1 % wrong mostly 13 or more.
-ELSEWHERE = 10.0
 
 
 def _without_outliers(views: list[TagView], bundle: BundlePose) -> list[TagView] | None:
-    """Views without outlier edges, or None if there are no outliers."""
+    """Views without outlier edges, or None if there are no outliers.
+
+    Of four edges or fewer none is left out: the others fit exactly, whichever it is.
+    """
     errors = bundle.edge_errors
     measured = np.array([view.seen.edges for view in views])
+    if bundle.freedom <= 2:
+        return None
     usual = max(1.0, float(np.median(errors[measured])) / 1.18)  # median of Rayleigh's distribution
     off = measured & (errors > FAR * usual)
     if not off.any():
@@ -324,29 +347,28 @@ def fit_inliers(
     return None
 
 
-def displaced_tag(
-    camera: Camera, views: Sequence[TagView], pose: Pose, expected: float, contradiction: float
-) -> TagView | None:
-    """The tag with the largest errors whose square is intact, but not where a pose puts it.
+def scatter_without_one(bundle: BundlePose, expected: float) -> Array:
+    """Mean square of the steps to the poses without one of four edges each, shape (6, 6).
 
-    What hides an edge of a tag or is mistaken for one does not leave a square. A tag of another
-    size, number or pose is a square: its edges fit each other at some pose, but not at this one.
+    Any three edges fit exactly. So if the misfit of four is significant, any one of them may carry
+    all of it, however little of it the pose leaves over. Otherwise the result is 0.
 
     Args:
-        camera: The camera.
-        views: Tags with all their measured edges.
-        pose: ``camera_from_body``.
-        expected: Squared error of an edge, in variances.
-        contradiction: Limit of the misfit of a tag's own edges, in `expected`.
+        bundle: The pose.
+        expected: The expected cost, `freedom` or more.
     """
-    errors = _edge_sizes(Squares.of(camera, views).errors(pose))
-    off = np.any(errors > ELSEWHERE * np.sqrt(expected), axis=1)
-    for index in map(int, np.argsort(-errors.sum(axis=1))):
-        view = views[index]
-        alone = solve_pnp(camera, [view]) if off[index] else None
-        if alone is not None and alone.cost <= contradiction * expected * max(1, alone.freedom):
-            return view
-    return None
+    if bundle.freedom != 2 or bundle.cost <= ONE_WRONG * expected:
+        return np.zeros((6, 6))
+    squares, pose = bundle.squares, bundle.camera_from_body
+    edges = squares.edges.reshape(-1)
+    errors = squares.errors(pose).reshape(-1, 2)[edges]
+    slopes = squares.jacobian(pose).reshape(-1, 2, 6)[edges]
+    rest = [np.delete(np.arange(4), k) for k in range(4)]
+    try:
+        steps = np.linalg.solve(slopes[rest].reshape(4, 6, 6), errors[rest].reshape(4, 6, 1))
+    except np.linalg.LinAlgError:  # three of the edges do not determine the pose
+        return np.full((6, 6), np.inf)
+    return read_only(np.mean(steps @ steps.swapaxes(1, 2), axis=0))
 
 
 def _in_front(squares: Squares, pose: Pose) -> bool:
@@ -362,20 +384,20 @@ def _different(poses: Sequence[Pose], from_: Sequence[Pose]) -> list[Pose]:
     return [p for p in poses if all(p.angle_to(q) > 0.05 for q in from_)]
 
 
-def _edge_sizes(errors: Array) -> Array:
+def edge_sizes(errors: Array) -> Array:
     """Size of each edge's error in deviations, shape (t, 4)."""
     return np.asarray(np.linalg.norm(errors.reshape(-1, 4, 2), axis=2))
 
 
 def _huber(errors: Array) -> float:
-    size = _edge_sizes(errors)
+    size = edge_sizes(errors)
     near = np.minimum(size, HUBER)
     return float(np.sum(near * (2.0 * size - near)))
 
 
 def huber_weights(errors: Array) -> Array:
     """Huber weight of every error, shape (8 t,)."""
-    size = np.maximum(_edge_sizes(errors), 1e-12)
+    size = np.maximum(edge_sizes(errors), 1e-12)
     return np.repeat(np.minimum(1.0, HUBER / size).reshape(-1), 2)
 
 
@@ -415,13 +437,12 @@ def _result(squares: Squares, pose: Pose, cost: float, rival: float) -> BundlePo
         covariance: Array = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     except np.linalg.LinAlgError:  # too few edges for six parameters
         covariance = np.full((6, 6), np.inf)
-    found = BundlePose(
+    return BundlePose(
         squares,
         pose,
-        covariance,
+        read_only(covariance),
         cost,
         rival,
         max(freedom, 0),
-        read_only(_edge_sizes(errors)),
+        read_only(edge_sizes(errors)),
     )
-    return replace(found, covariance=read_only(found.misfit(found.freedom) * covariance))

@@ -168,7 +168,10 @@ def _nothing_seen(
     elif PERHAPS_MOVED in reason:
         next_step = "take more images; if the camera moved, restore it or calibrate its pose again"
     elif UNSHARP in reason or soft:
-        next_step = "focus the camera on the platform, and add light to shorten the exposure"
+        next_step = (
+            "focus the camera on the platform, add light to shorten the exposure, and clear the"
+            " edges of the tags"
+        )
     elif ROTATED in reason:
         next_step = (
             "rotate the platform back; if it is not rotated so far, check rotation_wxyz of"

@@ -21,11 +21,12 @@ from tracking.detection.detector import (
     region_around,
 )
 from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored
-from tracking.estimator import CAUSE, PlatformEstimator, TrackerSettings
+from tracking.estimator import CAUSE, UNEVEN, PlatformEstimator
 from tracking.measurement import (
     NoPose,
     Observation,
     PoseMeasurement,
+    TrackerSettings,
     largest_deviations,
     predict,
 )
@@ -151,6 +152,8 @@ class Tracker:
         self._pictures = 0
         self._failed: tuple[int, CameraCheck] | None = None
         """Number of the image, and check, until one passes."""
+        self._passed: tuple[int, float] | None = None
+        """Number and time of the last image whose check passed."""
 
     @property
     def expected_tags(self) -> tuple[int, ...]:
@@ -192,13 +195,14 @@ class Tracker:
         if result is None:
             result = self._search(image, time)
         elif self._failed or self._pictures % self.settings.camera_check_period == 0:
-            self._check_camera(
-                image, detect_expected(self.camera, self._frame, self._detector, image)
-            )
+            detections = detect_expected(self.camera, self._frame, self._detector, image)
+            self._check_camera(image, time, detections)
         if self._failed is not None:
             result = NoPose(time, self._suspicion(self._failed[1]))
-        if isinstance(result, NoPose) and CAUSE in result.reason and self._is_uncorrected(time):
-            result = replace(result, reason=result.reason.replace(CAUSE, f"{CAUSE}, {MOVING}"))
+        if isinstance(result, NoPose) and self._is_uncorrected(time):
+            for cause in (CAUSE, UNEVEN):
+                reason = result.reason.replace(cause, f"{cause}, {MOVING}")
+                result = replace(result, reason=reason)
         self._before, self._last = self._last, None
         if isinstance(result, PoseMeasurement):
             self._last = result
@@ -253,7 +257,7 @@ class Tracker:
         return found
 
     def _checked(self, image: Image, time: float, detections: Sequence[Detection]) -> Observation:
-        self._check_camera(image, detections)
+        self._check_camera(image, time, detections)
         return self._estimator.measured(image, time, detections, None, "found")
 
     def _is_plausible(self, found: Observation, last: PoseMeasurement) -> bool:
@@ -266,7 +270,7 @@ class Tracker:
             return False
         return found.pose.angle_to(last.pose) <= self.settings.jump_angle
 
-    def _check_camera(self, image: Image, detections: Sequence[Detection]) -> None:
+    def _check_camera(self, image: Image, time: float, detections: Sequence[Detection]) -> None:
         views = self._estimator.views(
             image, nearest_to_expected(self.camera, self._frame, detections), self._frame
         )
@@ -278,7 +282,13 @@ class Tracker:
             )
         except CameraMoved as moved:
             if not are_mirrored(image, self._detector, (*self._frame, *self.expected_tags)):
-                raise
+                raise CameraMoved(
+                    moved.what,
+                    where=moved.where,
+                    why=f"{moved.why}; {self._doubtful()}",
+                    next_step=moved.next_step,
+                    values=moved.values,
+                ) from None
             raise CameraMoved(
                 f"{MIRRORED}: they show more tags of the rig if mirrored again",
                 where=f"camera {self.camera.name!r}",
@@ -287,6 +297,18 @@ class Tracker:
             ) from None
         if check is not None:
             self._failed = (self._pictures, check) if check.error > self._moved_px else None
+            if self._failed is None:
+                self._passed = (self._pictures, time)
+
+    def _doubtful(self) -> str:
+        """Which poses may be wrong once the camera is found to have moved."""
+        if self._passed is None:
+            return "no image has passed this check, so all poses are doubtful"
+        number, time = self._passed
+        return (
+            f"image {number}, at {time:.3f} s, was the last to pass this check, so poses measured"
+            " after it are doubtful"
+        )
 
     def _suspicion(self, failed: CameraCheck) -> str:
         return (

@@ -27,7 +27,7 @@ from tracking.detection.detector import Detection, make_detector
 from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored, diagnose_tags
 from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror, modules_across
 from tracking.edges.refine import RefinedTag, refine
-from tracking.estimator import TrackerSettings
+from tracking.measurement import TrackerSettings
 from tracking.pnp import BundlePose, TagView, solve_pnp
 
 

@@ -14,7 +14,8 @@ from tests.tracking.tag_images import small_camera
 from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.estimator import TrackerSettings, rejection_reason
+from tracking.estimator import rejection_reason
+from tracking.measurement import TrackerSettings
 from tracking.pnp import (
     BundlePose,
     Squares,

@@ -15,10 +15,13 @@ from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
-from tracking.camera_model import Image
-from tracking.estimator import TrackerSettings, find_consensus
-from tracking.measurement import NoPose, PoseMeasurement, predict
-from tracking.pnp import TagView
+from tracking.camera_model import Image, pixels_of
+from tracking.detection.detector import TagDetector
+from tracking.detection.tags import tag_corners
+from tracking.estimator import PlatformEstimator, find_consensus, rejection_reason
+from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings, predict
+from tracking.pnp import TagView, solve_pnp
+from tracking.rolling_shutter import RecentMotion
 from tracking.track import NoPlatformSeen, track
 from tracking.tracker import Tracker
 
@@ -363,3 +366,68 @@ def test_tags_whose_numbers_are_swapped_give_no_pose(
         found = Tracker(replace(rig, platform_tags=tags), camera).observe(image, 0.0)
         assert isinstance(found, NoPose)
         assert re.search("contradict each other|inconsistent|fits", found.reason)
+
+
+def near_tag(rig: Rig, camera: Camera) -> tuple[Rig, Camera]:
+    """A rig with tag 301 only, and a camera 0.65 m in front of it."""
+    one = replace(rig, platform_tags=rig.platform_tags[:1], frame_tags=())
+    side = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    return one, replace(camera, world_from_camera=Pose(np.array([0.7, 0.0, 0.445]), side))
+
+
+def with_bar(image: Image, camera: Camera, pose: Pose, tag: Tag, width: float) -> Image:
+    """The image with something as dark as ink along a whole edge of a tag, of a width [m]."""
+    first, second, _, before = tag_corners(tag)
+    along, outward = (second - first) / tag.size, (first - before) / tag.size
+    ends = np.array([first - tag.size / 8.0 * along, second + tag.size / 8.0 * along])
+    bar = np.vstack([ends, ends[::-1] + width * outward])
+    seen = pixels_of(camera, camera.world_from_camera.inverse().compose(pose).apply(bar))
+    dark = int(np.percentile(image, 0.1))
+    barred = image.copy()
+    cv2.fillConvexPoly(barred, np.round(seen * 16).astype(np.int32), dark, cv2.LINE_AA, 4)
+    return barred
+
+
+@pytest.mark.parametrize("width_mm", [1.5, 2.5, 5.0])
+def test_a_bar_along_an_edge_of_a_lone_tag_gives_no_wrong_pose(
+    rig: Rig, camera: Camera, empty: Scene, width_mm: float
+) -> None:
+    """Three edges fit a pose exactly, so a good one was left out: 30 mm off with 1 mm stated."""
+    (one, close), rng, reasons = near_tag(rig, camera), np.random.default_rng(2), []
+    for number in range(12):
+        turn = matrix_from_rotation_vector(np.radians(rng.uniform(-30.0, 30.0, 3)))
+        truth = Pose(rng.uniform([-0.03, -0.03, 0.415], [0.03, 0.03, 0.475]), turn)
+        image = SyntheticCamera(one, empty, close, seed=number).render(truth, 0)
+        assert isinstance(Tracker(one, close).observe(image, 0.0), PoseMeasurement)
+        barred = with_bar(image, close, truth, one.platform_tags[0], width_mm / 1e3)
+        found = Tracker(one, close).observe(barred, 0.0)
+        if isinstance(found, PoseMeasurement):
+            error = error_of(found, truth)
+            assert error @ np.linalg.solve(found.covariance, error) < 30.0
+        else:
+            reasons.append(found.reason)
+    assert not any("compare size_mm" in reason for reason in reasons)  # it is not the cause
+    stated = "one of the four edges of tags 301 is wrong|the edges of tag 301 form no square"
+    assert any(re.match(stated, reason) for reason in reasons)
+
+
+def test_three_edges_of_a_lone_tag_give_no_pose(rig: Rig, camera: Camera, empty: Scene) -> None:
+    """Any three fit a pose exactly, also if one of them is a bar's."""
+    one, close = near_tag(rig, camera)
+    truth = Pose.level([0.0, 0.0, 0.445])
+    image = SyntheticCamera(one, empty, close, seed=1).render(truth, 0)
+    estimator = PlatformEstimator(one, close, TrackerSettings(), RecentMotion(0.0))
+    detections = TagDetector(one.tag_family).detect_all(image)
+    (view,) = estimator.views(image, detections, {301: one.platform_tags[0]})
+    keep = np.repeat([True, True, True, False], 2)
+    seen = replace(
+        view.seen,
+        edges=keep[::2],
+        whitening=view.seen.whitening * keep[:, None],
+        target=view.seen.target * keep,
+    )
+    bundle = solve_pnp(close, [TagView(view.tag, seen)])
+    assert bundle is not None
+    views = [TagView(view.tag, seen)]
+    reason = rejection_reason(TrackerSettings(), views, bundle, None, 3, 1.0, [])
+    assert reason == "only 3 edges of tags 301 are measured: any three fit a pose exactly"

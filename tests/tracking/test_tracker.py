@@ -26,8 +26,7 @@ from tracking.camera_model import Image, pixels_of
 from tracking.detection.detector import Detection, TagDetector
 from tracking.detection.diagnostics import are_mirrored, diagnose_tags
 from tracking.detection.tags import alike_in_mirror, dictionary
-from tracking.estimator import TrackerSettings
-from tracking.measurement import NoPose, PoseMeasurement
+from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings
 from tracking.shared_errors import CameraMoved
 from tracking.tracker import Tracker
 
@@ -248,8 +247,12 @@ def test_a_camera_moved_during_a_run_is_noticed(
     tracker = Tracker(rig, camera, TrackerSettings(camera_check_period=2))
     truth = Pose.level([0.0, 0.0, 0.445])
     assert isinstance(tracker.observe(synthetic.render(truth, 0), 0.0), PoseMeasurement)
-    with pytest.raises(CameraMoved):
+    with pytest.raises(CameraMoved) as caught:
         list(tracker.observe(later.render(truth, frame), frame * 0.1) for frame in range(1, 4))
+    assert caught.value.why.endswith(
+        "image 1, at 0.000 s, was the last to pass this check, so poses measured after it are"
+        " doubtful"
+    )
 
 
 def test_another_print_of_a_covered_frame_tag_costs_one_pose_and_not_the_camera(
