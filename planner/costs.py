@@ -1,9 +1,9 @@
-"""What a path costs: its length, or the line integral of the kinematic cost.
+"""What a path costs, and the best path within a length limit.
 
 The kinematic cost of a pose is c = γ_d + γ_f: the condition number of the structure matrix and the
 inverse volume of the force set, each scaled to 0..1 between its extremes over the workspace
 (paper, Eqs. 4, 5, 8 and section 3.2; see docs/paper.md for the corrections). A longest path is kept
-by a price of length, `LengthLimit`.
+by `LimitedSearch`.
 
 The objectives, with the weights of clearance and capacity, are in `planner.settings`; the optimal
 planner evaluates them in `planner.anytime.problem` and `planner.anytime_6d.problem`.
@@ -14,14 +14,16 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
 from model import kinematics
+from model.clearance import ClearanceModel
 from model.kinematics import cables_exist, cables_to, structure_matrix_of
 from model.pose import Array, Pose, interpolate
 from model.rig import Rig
@@ -32,7 +34,7 @@ from model.statics.gravity import inertial_wrench, weight_wrench
 from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
 from planner import space
 from planner.kernels.jit import stored
-from planner.settings import MARGIN_RESERVE
+from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE, OBJECTIVES, Weights
 from planner.space import Lattice, corners_and_weights
 
 _SAMPLING = 0.010
@@ -47,31 +49,6 @@ def _version() -> str:
     for module in _MODULES:
         digest.update(Path(str(module.__file__)).read_bytes())
     return digest.hexdigest()
-
-
-class Cost(Protocol):
-    """A cost of straight edges between coordinates."""
-
-    def edge(self, start: Array, end: Array) -> float:
-        """Cost of the straight edge from ``start`` to ``end``, shape (n,) each."""
-        ...
-
-    def edges(self, starts: Array, end: Array) -> Array:
-        """Costs of straight edges from many points, shape (k, n), to one; shape (k,)."""
-        ...
-
-
-class LengthCost:
-    """The length of an edge, [m]."""
-
-    def edge(self, start: Array, end: Array) -> float:
-        """Length of the edge, [m]."""
-        return float(np.linalg.norm(end - start))
-
-    def edges(self, starts: Array, end: Array) -> Array:
-        """Lengths of the edges, shape (k,), [m]."""
-        lengths: Array = np.linalg.norm(end - starts, axis=1)
-        return lengths
 
 
 class KinematicCost:
@@ -227,14 +204,19 @@ def capacity_margins(rig: Rig, scene: Scene, positions: Array, rotation: Array) 
     )
 
 
-# The best path within a length limit: a price λ of length is raised until the limit is kept.
+# The best path within a length limit.
 #
-# With the objective plus λ times the length, a higher λ gives a shorter path. Every few rounds λ is
-# raised where the best path is too long, else lowered, by steps halved towards the smallest λ that
-# keeps the limit; the best path within the limit is kept. A path not yet polished may mislead, so
-# steps grow again where λ has to move in one direction for long.
+# A search seeks the shortest path until the limit is kept; only then does the objective count, plus
+# a price λ of length. A higher λ gives a shorter path. Every few rounds λ is raised where the best
+# path is too long, else lowered, by steps halved towards the smallest λ that keeps the limit. A
+# path not yet polished may mislead, so steps grow again where λ has to move in one direction for
+# long.
+#
+# A price of length hardly ever leads to a clearance between the least and the largest possible. So
+# clearance is not left to the price but demanded, of one search after the other.
 
 
+_CLEARANCE_ROUND_OFF = 1e-9
 LENGTH_ROUND_OFF = 1e-9
 """Tolerance of a longest path, [m]: one of exactly the straight distance is a path."""
 _ROUNDS = 6
@@ -249,48 +231,24 @@ _PERSISTENT, _GROWTH = 4, 1.5
 which the direction changed, but not past it."""
 
 
-class LengthLimit:
+class LengthPrice:
     """The search for λ, updated after every round.
 
     Attributes:
         price: λ, cost of a metre on top of the objective.
-        path: The best path found that is short enough, shape (k, n); None without one.
     """
 
-    def __init__(self, longest: float, unit: float) -> None:
-        """Begins without a price of length.
-
-        Args:
-            longest: Longest path allowed, [m].
-            unit: Typical cost of a metre by the objective.
-        """
+    def __init__(self, unit: float) -> None:
+        """Begins without a price of length; ``unit`` is the objective's typical cost of a metre."""
         self.price = 0.0
-        self.path: Array | None = None
-        self._longest, self._unit = longest, unit
+        self._unit = unit
         self._step, self._repeated, self._was_short = _COARSEST, _PERSISTENT - 1, False
         self._rounds = 0
-        self._least = math.inf
 
-    def after_round(self, path: Array, length: float, cost: Callable[[], float]) -> bool:
-        """Records the best path at this price; changes the price every few rounds.
-
-        Args:
-            path: Best path of the round, shape (k, n).
-            length: Its length, [m].
-            cost: Computes its cost by the objective alone.
-
-        Returns:
-            Whether the price has changed.
-        """
-        short_enough = length <= self._longest + LENGTH_ROUND_OFF
-        if short_enough:
-            self._keep(path, cost())
+    def after_round(self, short_enough: bool) -> bool:
+        """Changes the price every few rounds; returns whether it has."""
         self._rounds += 1
         return self._rounds % _ROUNDS == 0 and self._moved(short_enough)
-
-    def _keep(self, path: Array, cost: float) -> None:
-        if cost < self._least:
-            self._least, self.path = cost, path
 
     def _moved(self, short_enough: bool) -> bool:
         self._repeated = self._repeated + 1 if short_enough == self._was_short else 1
@@ -303,3 +261,184 @@ class LengthLimit:
         wanted = self.price * 2.0 ** (-self._step if short_enough else self._step)
         self.price = min(max(wanted, _LEAST * self._unit), _MOST)
         return True
+
+
+class ClearanceSteps:
+    """The clearance to demand next: higher by steps that grow with success, else are halved.
+
+    Attributes:
+        demanded: Clearance, [m].
+    """
+
+    _FINEST = 2e-5
+    _GROWTH = 1.5
+
+    def __init__(self, least: float, most: float) -> None:
+        """Begins with the least clearance; the first step leads to the middle, [m]."""
+        self.demanded = self._best = least
+        self._most, self._step, self._grows = most, (most - least) / 2.0, False
+
+    def after_search(self, improved: bool) -> bool:
+        """Moves on from a search; returns whether there is a higher clearance to demand."""
+        if improved:
+            self._best = self.demanded
+            self._step *= self._GROWTH if self._grows else 1.0
+        else:
+            self._step = max(self._step / 2.0, self._FINEST)
+        self._grows = True
+        self.demanded = min(self._best + self._step, self._most)
+        return self.demanded > self._best
+
+
+class RoundSearch(Protocol):
+    """A search in rounds whose objective can be changed."""
+
+    @property
+    def path(self) -> Array | None:
+        """The best path, shape (k, n); None without one."""
+        ...
+
+    @property
+    def length(self) -> float:
+        """Length of the best path, [m]; infinite without one."""
+        ...
+
+    @property
+    def checks(self) -> int:
+        """Number of edges checked."""
+        ...
+
+    def advance(self) -> None:
+        """Does one round."""
+        ...
+
+    def weigh(self, weights: Weights) -> None:
+        """Changes the weights of the objective."""
+        ...
+
+    def cost_by(self, weights: Weights) -> float:
+        """Cost of the best path by other weights."""
+        ...
+
+
+Search = TypeVar("Search", bound=RoundSearch)
+
+
+class LimitedSearch(Generic[Search]):
+    """Searches for the best path within a length limit, one for each clearance demanded.
+
+    Attributes:
+        first: The first search, with the scene's own clearance.
+        path: The best path found that is short enough, shape (k, n); None without one.
+    """
+
+    _FEWEST, _FEWEST_OF_PRICES = 16, 48
+    """Rounds of a search at least; the second where λ has to be found."""
+    _SHARE = 8
+    """A search may take one in this many of the rounds before it."""
+    _EAGER = 10.0
+    """With the length as the only other term, and clearance weighed higher by this factor, a search
+    ends with its first path within the limit: more clearance is worth more than polishing."""
+
+    def __init__(
+        self,
+        begin: Callable[[Scene, Weights], Search],
+        scene: Scene,
+        weights: Weights,
+        longest: float,
+        kinematic: KinematicCost,
+    ) -> None:
+        """Begins the first search.
+
+        Args:
+            begin: Makes a search of a scene by weights.
+            scene: Obstacles, clearances, start and goal.
+            weights: The objective, with a scale of 1.
+            longest: Longest path allowed, [m].
+            kinematic: The cost of poses at the start's orientation.
+        """
+        self.path: Array | None = None
+        self._begin, self._scene = begin, scene
+        self._weights, self._longest = weights, longest
+        self._rest = replace(weights, clearance=0.0).normalized()
+        self._unit = typical_cost(self._rest, kinematic)
+        self._eager = self._rest.is_length and weights.clearance > self._EAGER * weights.length
+        most = _largest_clearance(kinematic.rig, scene) if weights.clearance > 0.0 else 0.0
+        least = scene.obstacle_clearance
+        self._steps = ClearanceSteps(least, most) if least < most < math.inf else None
+        self._rounds, self._checks, self._least = 0, 0, math.inf
+        self._own_rounds, self._allowed = 0, 0
+        self._before = self._of_search = math.inf
+        self._price: LengthPrice | None = None
+        self.first = self._search = self._open(scene)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the best path within the limit; infinite without one."""
+        return self._least
+
+    @property
+    def checks(self) -> int:
+        """Number of edges checked."""
+        return self._checks + self._search.checks
+
+    def advance(self) -> None:
+        """Does one round."""
+        if self._steps is not None and self._is_done():
+            self._next(self._steps)
+        search = self._search
+        search.advance()
+        self._rounds += 1
+        self._own_rounds += 1
+        path, length = search.path, search.length
+        short_enough = length <= self._longest + LENGTH_ROUND_OFF
+        if path is not None and short_enough:
+            self._record(path, search.cost_by(self._weights))
+        if self._price is not None:
+            if self._price.after_round(short_enough):
+                length_weight = self._rest.length + self._price.price
+                search.weigh(replace(self._rest, length=length_weight))
+        elif short_enough and not self._rest.is_length:
+            self._price = LengthPrice(self._unit)
+            search.weigh(self._rest)
+
+    def _open(self, scene: Scene) -> Search:
+        """A new search, for the shortest path at first."""
+        search = self._begin(scene, self._rest)
+        search.weigh(OBJECTIVES["length"])
+        self._price = None
+        self._own_rounds, self._before, self._of_search = 0, self._least, math.inf
+        fewest = self._FEWEST if self._rest.is_length else self._FEWEST_OF_PRICES
+        self._allowed = max(fewest, self._rounds // self._SHARE)
+        return search
+
+    def _is_done(self) -> bool:
+        if self.path is None:
+            return False
+        return self._own_rounds >= self._allowed or (self._eager and self._of_search < math.inf)
+
+    def _next(self, steps: ClearanceSteps) -> None:
+        improved = self._of_search < self._before
+        if not steps.after_search(improved):
+            self._steps = None
+            return
+        self._checks += self._search.checks
+        self._search = self._open(self._scene.changed(clearance=steps.demanded))
+
+    def _record(self, path: Array, cost: float) -> None:
+        self._of_search = min(self._of_search, cost)
+        if cost < self._least:
+            self._least, self.path = cost, path
+
+
+def typical_cost(weights: Weights, kinematic: KinematicCost) -> float:
+    """Typical cost of a metre by length and kinematic cost."""
+    return weights.length + weights.kinematic * float(kinematic.values.mean())
+
+
+def _largest_clearance(rig: Rig, scene: Scene) -> float:
+    """The largest clearance that start and goal allow to demand, [m]."""
+    model = ClearanceModel(rig, scene)
+    found = [model.smallest(pose) for pose in (scene.start, scene.goal)]
+    least = min((near.distance for near in found if near is not None), default=math.inf)
+    return least - CLEARANCE_RESERVE - _CLEARANCE_ROUND_OFF

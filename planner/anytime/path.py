@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -36,11 +35,11 @@ from planner.anytime.problem import (
     set_weights,
 )
 from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
-from planner.costs import KinematicCost, LengthLimit
+from planner.costs import KinematicCost, LimitedSearch
 from planner.kernels.jit import kernel, leaf
 from planner.kernels.primitives import uniform
 from planner.path import Progress, Route
-from planner.settings import OptimalSettings, least_rounds
+from planner.settings import OptimalSettings, Weights, least_rounds
 from planner.wrench.translation import edge_held
 
 _TRIALS, _SLOW_TRIALS = 400, 100
@@ -307,78 +306,126 @@ def optimal_route(
     Raises:
         NoSolution: There is no path, none was found, or none is short enough.
     """
-    problem = problem_of(rig, scene, settings.weights.normalized(), kinematic)
-    start, goal = np.array(scene.start.position), np.array(scene.goal.position)
-    search = new_search(start, goal, settings.seed)
-    _load(problem, search)
+    weights = settings.weights.normalized()
+
+    def begin(at: Scene, by: Weights) -> CompiledSearch:
+        return CompiledSearch(rig, at, by, kinematic, settings.seed)
+
+    _load(begin(scene, weights))
+    limited = None
+    if settings.longest < math.inf:
+        limited = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
+    search = begin(scene, weights) if limited is None else limited.first
     prepared = clock()
-    path = _improved(problem, search, settings, prepared, progress, clock)
+    rounds = _improve(limited or search, search, settings, prepared, progress, clock)
+    path = search.path if limited is None else limited.path
     if path is None:
-        raise no_path(rig, scene, problem, search, settings)
-    first = search.first[: search.totals[4]].copy()
-    checks = int(search.totals[2] + search.grown[2] + search.counts[:, 1].sum())
-    return Route.from_rounds(path, first, int(search.totals[0]), checks, clock() - prepared)
+        raise no_path(rig, scene, search.problem, search.state, settings)
+    checks = search.checks if limited is None else limited.checks
+    return Route.from_rounds(path, search.first, rounds, checks, clock() - prepared)
 
 
-def _load(problem: PathProblem, search: AnytimeSearch) -> None:
+class CompiledSearch:
+    """A compiled search as an object.
+
+    Attributes:
+        problem: Limits and costs.
+        state: Of the search.
+    """
+
+    def __init__(
+        self, rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCost, seed: int
+    ) -> None:
+        """A search that has not begun; see `optimal_route` for the arguments."""
+        self.problem = problem_of(rig, scene, weights, kinematic)
+        start, goal = np.array(scene.start.position), np.array(scene.goal.position)
+        self.state = new_search(start, goal, seed)
+        self._handle = handle_of(self.problem, self.state)
+
+    @property
+    def cost(self) -> float:
+        """Cost of the best path; infinite without one."""
+        return float(self.state.costs[BEST])
+
+    @property
+    def path(self) -> Array | None:
+        """The best path, shape (k, 3), [m]; None without one."""
+        return best_path(self.state)
+
+    @property
+    def length(self) -> float:
+        """Length of the best path, [m]; infinite without one."""
+        path = self.path
+        if path is None:
+            return math.inf
+        return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+    @property
+    def first(self) -> Array:
+        """The very first path, shape (k, 3), [m]; empty without one."""
+        return self.state.first[: self.state.totals[4]].copy()
+
+    @property
+    def checks(self) -> int:
+        """Number of edges checked."""
+        state = self.state
+        return int(state.totals[2] + state.grown[2] + state.counts[:, 1].sum())
+
+    def advance(self) -> None:
+        """Does one round."""
+        advance(self._handle, 1)
+
+    def weigh(self, weights: Weights) -> None:
+        """Changes the weights of the objective."""
+        set_weights(self.problem, weights)
+        measure_again(self.problem, self.state)
+
+    def cost_by(self, weights: Weights) -> float:
+        """Cost of the best path by other weights; infinite without one."""
+        path = self.path
+        if path is None:
+            return math.inf
+        problem = self.problem._replace(terms=self.problem.terms.copy())
+        set_weights(problem, weights)
+        return float(measure(problem, polyline_of(path)))
+
+
+def _load(search: CompiledSearch) -> None:
     """Calls every kernel of a round once, so that compiling or loading is not timed."""
-    advance(handle_of(problem, search), 0)
-    measure_again(problem, search)
-    measure(problem, polyline_of(search.ends))
+    advance(handle_of(search.problem, search.state), 0)
+    measure_again(search.problem, search.state)
+    measure(search.problem, polyline_of(search.state.ends))
 
 
-def _improved(
-    problem: PathProblem,
-    search: AnytimeSearch,
+def _improve(
+    to_do: CompiledSearch | LimitedSearch[CompiledSearch],
+    search: CompiledSearch,
     settings: OptimalSettings,
     began: float,
     progress: Progress | None,
     clock: Clock,
-) -> Array | None:
-    """Does rounds until the budget is spent or the path is known to be optimal."""
-    limit = None
-    if settings.longest < math.inf:
-        limit = LengthLimit(settings.longest, problem.terms[UNIT])
-    handle = handle_of(problem, search)
-    spent, reported = 0.0, 0.0
-    while not _is_over(problem, settings, search, spent):
-        cost = advance(handle, 1)
-        if limit is not None:
-            _apply_limit(problem, search, settings, limit)
-        elif cost <= _least(search, settings):
+) -> int:
+    """Does rounds until the budget is spent or the path is known to be optimal; their number.
+
+    ``search`` is the one with the scene's own clearance; ``began`` the time of the clock, [s].
+    """
+    rounds, spent, reported = 0, 0.0, 0.0
+    while not _is_over(search, settings, rounds, spent):
+        to_do.advance()
+        rounds += 1
+        if search.cost <= _least(search.state, settings):
             break
         spent = clock() - began
         if progress is not None and spent - reported >= _REPORT_EVERY:
             reported = spent
-            settings.report(progress, int(search.totals[0]), spent, float(search.costs[BEST]))
-    return limit.path if limit is not None else best_path(search)
+            settings.report(progress, rounds, spent, to_do.cost)
+    return rounds
 
 
-def _apply_limit(
-    problem: PathProblem, search: AnytimeSearch, settings: OptimalSettings, limit: LengthLimit
-) -> None:
-    """Passes the best path to the limit and applies the price it sets."""
-    path, weights = best_path(search), settings.weights.normalized()
-    if path is None:
-        return
-
-    def cost() -> float:
-        set_weights(problem, weights)
-        return float(measure(problem, polyline_of(path)))
-
-    length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
-    changed = limit.after_round(path, length, cost)
-    set_weights(problem, replace(weights, length=weights.length + limit.price))
-    if changed:
-        measure_again(problem, search)
-
-
-def _is_over(
-    problem: PathProblem, settings: OptimalSettings, search: AnytimeSearch, spent: float
-) -> bool:
-    rounds, begun = int(search.totals[0]), int(search.totals[5])
+def _is_over(search: CompiledSearch, settings: OptimalSettings, rounds: int, spent: float) -> bool:
+    begun = int(search.state.totals[5])
     least = least_rounds(has_limit=settings.longest < math.inf)
-    if problem.terms[LEAST_MARGIN] == ASK_PROOF:
+    if search.problem.terms[LEAST_MARGIN] == ASK_PROOF:
         least = LEAST_WITH_PROOFS
     return settings.is_over(rounds, spent, begun + least)
 

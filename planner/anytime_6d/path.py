@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from planner.anytime_6d.connect import connect
 from planner.anytime_6d.local_search import Line, copied, line_length, measure, new_line, polish
 from planner.anytime_6d.problem import RotatingProblem, build_objective, move_length, set_weights
 from planner.collision.world import build_robot, build_world
-from planner.costs import KinematicCost, LengthLimit, margin_reserve
+from planner.costs import KinematicCost, LimitedSearch, margin_reserve
 from planner.edge_checks import REASONS
 from planner.path import Progress, Route, smallest_gap
 from planner.settings import (
@@ -77,6 +77,11 @@ class RotatingSearch:
     def cost(self) -> float:
         """Cost of the best path; infinite without one."""
         return math.inf if self._best is None else self._best.cost
+
+    @property
+    def checks(self) -> int:
+        """Number of moves checked."""
+        return int(self.tallies.sum())
 
     @property
     def path(self) -> Array | None:
@@ -242,23 +247,26 @@ def rotating_route(
     space = PoseSpace(rig)
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
     _load(RotatingSearch(problem, start, goal, settings.seed), weights)
-    search, began = RotatingSearch(problem, start, goal, settings.seed), clock()
-    limit = None
+
+    def begin(at: Scene, by: Weights) -> RotatingSearch:
+        return RotatingSearch(rotating_problem(rig, at, by, kinematic), start, goal, settings.seed)
+
+    limited = None
     if settings.longest < math.inf:
-        limit = LengthLimit(settings.longest, _unit(weights, kinematic))
-    spent = 0.0
-    while not _is_over(settings, search, spent):
-        search.advance()
-        if limit is not None:
-            _apply_limit(limit, search, weights)
-        spent = clock() - began
-        if progress is not None and search.rounds % _REPORT_EVERY == 0:
-            settings.report(progress, search.rounds, spent, search.cost)
-    path = search.path if limit is None else limit.path
+        limited = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
+    search = (
+        RotatingSearch(problem, start, goal, settings.seed) if limited is None else limited.first
+    )
+    began, spent, rounds, to_do = clock(), 0.0, 0, search if limited is None else limited
+    while not _is_over(settings, search, rounds, spent):
+        to_do.advance()
+        rounds, spent = rounds + 1, clock() - began
+        if progress is not None and rounds % _REPORT_EVERY == 0:
+            settings.report(progress, rounds, spent, to_do.cost)
+    path = to_do.path
     if path is None:
         raise _no_path(scene, search, settings)
-    checks = int(search.tallies.sum())
-    return Route.from_rounds(path, search.first, search.rounds, checks, clock() - began)
+    return Route.from_rounds(path, search.first, rounds, to_do.checks, clock() - began)
 
 
 def _load(search: RotatingSearch, weights: Weights) -> None:
@@ -267,25 +275,11 @@ def _load(search: RotatingSearch, weights: Weights) -> None:
     search.cost_by(weights)
 
 
-def _unit(weights: Weights, kinematic: KinematicCost) -> float:
-    """Typical cost of a metre."""
-    return weights.length + weights.kinematic * float(kinematic.values.mean())
-
-
-def _apply_limit(limit: LengthLimit, search: RotatingSearch, weights: Weights) -> None:
-    """Passes the best path to the limit and applies the price it sets."""
-    path = search.path
-    if path is None:
-        return
-    if limit.after_round(path, search.length, lambda: search.cost_by(weights)):
-        search.weigh(replace(weights, length=weights.length + limit.price))
-
-
-def _is_over(settings: TurningSettings, search: RotatingSearch, spent: float) -> bool:
+def _is_over(settings: TurningSettings, search: RotatingSearch, rounds: int, spent: float) -> bool:
     if settings.weights.is_length and search.cost <= search.shortest * (1.0 + 1e-12):
         return True
     least = least_rounds(has_limit=settings.longest < math.inf)
-    return settings.is_over(search.rounds, spent, least)
+    return settings.is_over(rounds, spent, least)
 
 
 def _no_path(scene: Scene, search: RotatingSearch, settings: TurningSettings) -> NoSolution:

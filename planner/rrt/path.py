@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
+from typing import Protocol
 
 import numpy as np
 
@@ -17,12 +18,37 @@ from model.errors import NoSolution
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
-from planner.costs import Cost, KinematicCost, LengthCost
+from planner.costs import KinematicCost
 from planner.path import Progress, Route
 from planner.rrt.search import PaperPlanner, SearchResult
 from planner.settings import ATTEMPT_WITH_ROOM, CLEARANCE_RESERVE, PlannerSettings
 
 IsFree = Callable[[Array, Array], bool]
+
+
+class Cost(Protocol):
+    """A cost of straight edges between coordinates."""
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Cost of the straight edge from ``start`` to ``end``, shape (n,) each."""
+        ...
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Costs of straight edges from many points, shape (k, n), to one; shape (k,)."""
+        ...
+
+
+class LengthCost:
+    """The length of an edge, [m]."""
+
+    def edge(self, start: Array, end: Array) -> float:
+        """Length of the edge, [m]."""
+        return float(np.linalg.norm(end - start))
+
+    def edges(self, starts: Array, end: Array) -> Array:
+        """Lengths of the edges, shape (k,), [m]."""
+        lengths: Array = np.linalg.norm(end - starts, axis=1)
+        return lengths
 
 
 def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -> Array:

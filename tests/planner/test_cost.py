@@ -12,9 +12,10 @@ from model.kinematics import structure_matrix
 from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Rig, rig_from_document
 from model.statics.wrench_sets import condition_number, force_volume, rms_anchor_radius
-from planner.costs import KinematicCost, LengthCost
+from planner.costs import KinematicCost
 from planner.kernels import jit as stored
 from planner.planning import make_plan, plan_from_waypoints
+from planner.rrt.path import LengthCost
 from planner.space import Lattice, corners_and_weights
 from tests.cli.plans import free_scene
 from tests.model.rig_builds import paper_rig_with_pulleys

@@ -10,22 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from model.errors import BadInput, distinct_figures
-from model.pose import Pose
+from model.pose import Array, Pose
 from model.rig import Rig
-from model.scene import empty_scene
-from planner.costs import KinematicCost, LengthLimit
+from model.scene import Scene, empty_scene
+from planner.costs import ClearanceSteps, KinematicCost, LengthPrice, LimitedSearch
 from planner.endpoints import require_feasible_length, require_usable_ends
 from planner.path import smallest_gap
-from planner.settings import OptimalSettings
-
-STRAIGHT = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0]])
+from planner.settings import OBJECTIVES, OptimalSettings, Weights
 
 
-def price_after(limit: LengthLimit, length: float) -> float:
-    """The price after paths of one length, enough of them to change it."""
+def price_after(prices: LengthPrice, short_enough: bool) -> float:
+    """The price after paths of one kind, enough of them to change it."""
     for _ in range(6):
-        limit.after_round(STRAIGHT, length, lambda: 0.0)
-    return limit.price
+        prices.after_round(short_enough)
+    return prices.price
 
 
 @given(st.floats(-5.0, 5.0), st.lists(st.booleans(), max_size=8), st.floats(0.1, 2.0))
@@ -33,20 +31,59 @@ def test_the_price_of_length_settles_at_the_least_whatever_the_first_paths_say(
     power: float, first: list[bool], unit: float
 ) -> None:
     """The first paths may be too long, or short enough by chance, at any price."""
-    limit, least = LengthLimit(1.0, unit), unit * 2.0**power
+    prices, least = LengthPrice(unit), unit * 2.0**power
     for short_enough in first:
-        price_after(limit, 0.9 if short_enough else 1.1)
-    prices = [price_after(limit, 0.9 if limit.price >= least else 1.1) for _ in range(80)]
-    assert min(prices[-8:]) < least <= max(prices[-8:])
-    assert max(prices[-8:]) <= 1.5 * min(prices[-8:])
+        price_after(prices, short_enough)
+    found = [price_after(prices, prices.price >= least) for _ in range(80)]
+    assert min(found[-8:]) < least <= max(found[-8:])
+    assert max(found[-8:]) <= 1.5 * min(found[-8:])
 
 
 @given(st.lists(st.booleans(), max_size=8))
 def test_where_the_objective_alone_keeps_the_limit_the_price_vanishes(first: list[bool]) -> None:
-    limit = LengthLimit(1.0, 1.0)
+    prices = LengthPrice(1.0)
     for short_enough in first:
-        price_after(limit, 0.9 if short_enough else 1.1)
-    assert min(price_after(limit, 0.9) for _ in range(40)) < 1e-3
+        price_after(prices, short_enough)
+    assert min(price_after(prices, True) for _ in range(40)) < 1e-3
+
+
+@given(st.floats(0.0, 1.0), st.floats(0.001, 0.1), st.floats(0.01, 1.0))
+def test_the_clearance_demanded_approaches_the_largest_that_the_limit_allows(
+    share: float, least: float, span: float
+) -> None:
+    steps, most = ClearanceSteps(least, least + span), least + share * span
+    found = least
+    for _ in range(60):
+        improved = steps.demanded <= most
+        found = max(found, steps.demanded if improved else 0.0)
+        if not steps.after_search(improved):
+            break
+    assert most - 1e-3 * span - 4e-5 <= found <= most
+
+
+class Fake:
+    """A search whose shortest path is as long as the clearance demanded asks for.
+
+    By any other objective its path is longer, unless the length has a high price.
+    """
+
+    checks = 1
+
+    def __init__(self, scene: Scene, shortest: float) -> None:
+        self.clearance = scene.obstacle_clearance
+        self.path: Array | None = np.array([[0.0, 0.0, 0.3], [0.3, 0.0, 0.3]])
+        self.length = self._shortest = shortest
+        self.objectives: list[Weights] = []
+
+    def advance(self) -> None:
+        """Every round finds the same path."""
+
+    def weigh(self, weights: Weights) -> None:
+        self.objectives.append(weights)
+        self.length = self._shortest + (0.0 if weights.kinematic <= weights.length else 0.5)
+
+    def cost_by(self, weights: Weights) -> float:
+        return weights.length * self.length - weights.clearance * self.clearance
 
 
 def test_a_limit_of_the_straight_distance_is_kept_by_the_straight_line(gachon: Rig) -> None:
@@ -56,9 +93,25 @@ def test_a_limit_of_the_straight_distance_is_kept_by_the_straight_line(gachon: R
     assert length > 0.3
     scene = empty_scene(gachon).changed(start=Pose.level(line[0]), goal=Pose.level(line[1]))
     require_feasible_length(scene, 0.3)
-    limit = LengthLimit(0.3, 1.0)
-    limit.after_round(line, length, lambda: 0.0)
-    assert limit.path is line
+    kinematic = KinematicCost(gachon, np.eye(3))
+    fake = Fake(scene, length)
+    search = LimitedSearch(lambda *_: fake, scene, OBJECTIVES["length"], 0.3, kinematic)
+    search.advance()
+    assert search.path is fake.path
+
+
+def test_the_shortest_path_is_sought_until_the_limit_is_kept(gachon: Rig) -> None:
+    scene, kinematic = empty_scene(gachon), KinematicCost(gachon, np.eye(3))
+    fake = Fake(scene, 0.4)
+    search = LimitedSearch(lambda *_: fake, scene, OBJECTIVES["kinematic"], 0.35, kinematic)
+    for _ in range(100):
+        search.advance()
+    assert search.path is None
+    assert fake.objectives == [OBJECTIVES["length"]]
+    fake.length = 0.35
+    search.advance()
+    assert search.path is fake.path
+    assert fake.objectives[-1] == OBJECTIVES["kinematic"]
 
 
 def test_the_gap_between_two_full_trees_is_exact_and_takes_little_memory() -> None:

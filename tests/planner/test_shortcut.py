@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from planner.costs import LengthCost
-from planner.rrt.path import cheapest_through, pull_tight
+from planner.rrt.path import LengthCost, cheapest_through, pull_tight
 
 COST = LengthCost()
 

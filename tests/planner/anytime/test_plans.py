@@ -151,6 +151,31 @@ def test_longer_limits_give_lower_integrals_and_every_limit_is_kept(gachon, read
         assert loose <= tight * 1.005
 
 
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_clearance_within_a_limit_is_that_of_the_shortest_path_of_this_length(
+    gachon, ready_scene, seed
+) -> None:
+    """The path of 689 mm that keeps 20 mm was missed by one of 660 mm with 10 mm."""
+    scene = ready_scene("environment_2")
+    shortest = planned(gachon, scene.changed(clearance=0.020), rounds=60).quality.length_mm
+    limit = shortest / 1e3 + 0.0005
+    document = planned(gachon, scene, "clearance", 300, seed=seed, longest=limit)
+    assert document.quality.length_mm <= limit * 1e3 + 1e-6
+    assert document.quality.obstacle_clearance.distance_mm > 18.5
+
+
+@pytest.mark.parametrize("cost", list(OBJECTIVES))
+def test_every_objective_finds_a_path_within_a_limit_that_the_shortest_keeps(
+    gachon, ready_scene, cost
+) -> None:
+    """Refused with the clearance as objective: its path was 0.1 mm too long."""
+    scene = ready_scene("environment_2")
+    document = planned(gachon, scene, cost, 200, seed=1, longest=0.6632)
+    assert document.quality.length_mm <= 663.2 + 1e-6
+    again = planned(gachon, scene, cost, 200, seed=1, longest=0.6632)
+    assert again.waypoints == document.waypoints
+
+
 def test_a_limited_plan_is_found_again_by_its_rounds(gachon, ready_scene) -> None:
     scene, ticks = ready_scene("environment_2"), count()
     settings = OptimalSettings(weights=OBJECTIVES["kinematic"], budget=1.0, longest=0.72)
