@@ -49,8 +49,8 @@ def hidden_package(error: ImportError) -> tuple[str, str] | None:
     """
     package = str(error.name).partition(".")[0]
     found = sys.modules.get(package)
-    places = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
-    theirs = [path for path in places if path and not Path(path).is_relative_to(_ROOT)]
+    locations = [getattr(found, "__file__", None), *getattr(found, "__path__", ())]
+    theirs = [path for path in locations if path and not Path(path).is_relative_to(_ROOT)]
     is_ours = (_ROOT / package / "__init__.py").is_file()
     return (package, theirs[0]) if is_ours and theirs else None
 

@@ -101,7 +101,7 @@ class CsvTable:
         return [row[index].strip() for row in self._rows]
 
     def require_no_gap(self) -> None:
-        """Refuses a table with an empty line between others, where a row's place is its number.
+        """Refuses a table with an empty line between others, for rows numbered by their order.
 
         Raises:
             BadInput: With the first line after a gap.
