@@ -12,12 +12,12 @@ planner evaluates them in `planner.anytime.problem` and `planner.anytime_6d.prob
 from __future__ import annotations
 
 import hashlib
+import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
@@ -39,16 +39,14 @@ from planner.space import Lattice, corners_and_weights
 
 _SAMPLING = 0.010
 _MODULES = (kinematics, wrench_sets, space)
-"""The indices on the lattice depend on these and on this module."""
+"""The indices on the lattice depend on these and on `KinematicCost`."""
 
 
 @cache
 def _version() -> str:
     """A hash of the code that computes the lattice; a change invalidates the cache."""
-    digest = hashlib.sha256(Path(__file__).read_bytes())
-    for module in _MODULES:
-        digest.update(Path(str(module.__file__)).read_bytes())
-    return digest.hexdigest()
+    sources = "".join(inspect.getsource(part) for part in (*_MODULES, KinematicCost))
+    return hashlib.sha256(sources.encode()).hexdigest()
 
 
 class KinematicCost:

@@ -1,4 +1,4 @@
-"""The result of a planner: a path, the raw path before post-processing, and search statistics."""
+"""What a planner finds: a path, its raw path and statistics; and poses joined to one curve."""
 
 from __future__ import annotations
 
