@@ -141,8 +141,17 @@ def test_another_print_of_a_frame_tag_does_not_move_the_camera(
 ) -> None:
     real = with_prints(rig, (402, [0.25, -0.25, 0.0]), size=0.2)
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
-    tracker = Tracker(rig, camera, TrackerSettings(camera_moved_px=0.2))
-    assert isinstance(tracker.observe(image, 0.0), PoseMeasurement)
+    limit = TrackerSettings(camera_moved_px=0.2)
+    assert isinstance(Tracker(rig, camera, limit).observe(image, 0.0), PoseMeasurement)
+    shift = np.array([2e-3, 0.0, 0.0])
+    moved = tuple(
+        replace(tag, pose=replace(tag.pose, position=tag.pose.position + shift))
+        for tag in rig.frame_tags
+    )
+    # The frame tags are checked with the print in view.
+    found = Tracker(replace(rig, frame_tags=moved), camera, limit).observe(image, 0.0)
+    assert isinstance(found, NoPose)
+    assert "camera" in found.reason
 
 
 def test_no_squares_agree_on_nothing(camera: Camera) -> None:
