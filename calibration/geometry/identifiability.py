@@ -1,4 +1,4 @@
-"""Which directions of a rig's parameters the data determine, and names for the others.
+"""Which directions of a rig's parameters the data determine, and the errors of a fit in them.
 
 Information of the data is relative to that of the rig file: along an eigenvector with a value above
 1 the data are more accurate. The others cannot be identified and are left as in the rig file.
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.geometry.fit import POSE_BEND, RigFit, RigFitter
+from calibration.geometry.fit import POSE_BEND, RigFit, RigFitter, poses_from_lengths
 from calibration.geometry.measurements import RigMeasurements
-from calibration.geometry.parameters import AXES, Parameters
+from calibration.geometry.model import RigModel
+from calibration.geometry.parameters import AXES, Parameters, rig_with
 from calibration.statistics import huber_weight, rms_bound, student_factor
+from model.kinematics import poses_near
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
@@ -316,3 +318,62 @@ def uncertainty_of_rig(
     common = read_only(-spread[:, None] * pulled)
     quantile = student_factor(count - 1)
     return RigUncertainty(by_scatter, by_jackknife, common, scatter, quantile)
+
+
+# Cross-validation: errors on held-out samples.
+
+
+FOLDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Cross-validation errors of samples.
+
+    Attributes:
+        before: Errors with the rig file, shape (n,), [m].
+        after: Errors with fits that left the sample out, shape (n,), [m].
+        poses: True for position errors; False for RMS cable residuals, without measured poses.
+    """
+
+    before: Array
+    after: Array
+    poses: bool
+
+
+def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation: float) -> HeldOut:
+    """Five-fold cross-validation.
+
+    Args:
+        parameters: The unknowns.
+        measured: Stationary samples.
+        length_deviation: Of a cable's length from the encoder, [m].
+
+    Raises:
+        Fault: A part of the measurements cannot be fitted.
+    """
+    n = len(measured)
+    posed = bool(measured.has_position.all())
+    before, after = np.empty(n), np.empty(n)
+    zero = np.zeros(len(parameters))
+    for fold in range(FOLDS):
+        out = np.arange(n) % FOLDS == fold
+        rest, left_out = measured.part(~out), measured.part(out)
+        fit, _ = identified(parameters, rest, length_deviation)
+        for errors, values in ((before, zero), (after, fit.values)):
+            errors[out] = _errors(parameters, values, left_out, posed)
+    return HeldOut(before, after, posed)
+
+
+def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
+    """Errors of held-out samples, shape (n,), [m]."""
+    model, geometry = RigModel(parameters, measured), parameters.geometry(values)
+    lengths, rig = model.counted.lengths(geometry), rig_with(parameters.rig, geometry)
+    if not posed:
+        found = poses_from_lengths(rig, lengths, measured.without_poses(), alone=True)
+        apart = model.residuals(values, *found)[:, : rig.cable_count]
+        return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
+    rotations = measured.first_rotations(rig)
+    found = poses_near(rig, lengths, measured.origins(rotations), rotations, steps=8)[:2]
+    apart = measured.measured_points(*found) - measured.positions
+    return np.asarray(np.linalg.norm(apart, axis=1))

@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.geometry.calibrate import RigCalibration
+from calibration.geometry.calibrate import RigCalibration, workspace_poses
 from calibration.geometry.model import RigModel
 from calibration.results import CalibrationVerdict, Issue
 from calibration.statistics import CONFIDENCE
-from model.pose import Array, matrix_from_rotation_vector
-from model.rig import Rig
+from model.pose import Array
 
 CONTRADICTION = 4.0
 """This many standard deviations from the rig file are significant."""
@@ -179,8 +177,6 @@ FAR = 5.0
 """Largest credible deviation from the rig file, in stated standard deviations."""
 SCATTERED = 2.0
 """Largest acceptable scatter of a sensor or of measured poses, in stated standard deviations."""
-_INSET = 0.15
-"""The workspace is assessed at its centre and this share inside its corners."""
 _COMMON = (
     "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
     " --pose-mm and --pose-deg, in Python pose_deviations=: all measured poses share it, so more of"
@@ -406,27 +402,3 @@ def _pose_issues(result: RigCalibration) -> list[Issue]:
         )
         if times > SCATTERED
     ]
-
-
-def workspace_poses(rig: Rig, tilt: float) -> tuple[Array, Array]:
-    """Poses at the centre and near the corners of the workspace, rotated about ±x and ±y.
-
-    Args:
-        rig: As in its file.
-        tilt: Angle of rotation, [rad]; 0 for the orientation of home only.
-
-    Returns:
-        Positions, shape (k, 3), [m], and rotations, shape (k, 3, 3).
-    """
-    centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
-    half = (0.5 - _INSET) * (rig.workspace_upper - rig.workspace_lower)
-    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
-    positions = centre + np.concatenate([np.zeros((1, 3)), corners])
-    axes = [(1, 0), (-1, 0), (0, 1), (0, -1)] if tilt else [(0, 0)]
-    turns = [matrix_from_rotation_vector((tilt * x, tilt * y, 0.0)) for x, y in axes]
-    rotations = np.array(turns) @ rig.home.rotation
-    pairs = list(product(range(len(positions)), range(len(rotations))))
-    return (
-        np.array([positions[i] for i, _ in pairs]),
-        np.array([rotations[j] for _, j in pairs]),
-    )

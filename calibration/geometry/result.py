@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from calibration.geometry.calibrate import RigCalibration
-from calibration.geometry.quality import RigQuality, workspace_poses
+from calibration.geometry.calibrate import RigCalibration, workspace_poses
+from calibration.geometry.quality import RigQuality
 from calibration.results import ResultDocument, common_keys
 from calibration.statistics import Interval
 from model.errors import BadInput, Fault

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from calibration.geometry.calibrate import RigCalibration, fit_rig
+from calibration.geometry.calibrate import RigCalibration, fit_rig, workspace_poses
 from calibration.geometry.fit import RigFitter
 from calibration.geometry.identifiability import identified, uncertainty_of_rig
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
-from calibration.geometry.quality import judge_rig, workspace_poses
+from calibration.geometry.quality import judge_rig
 from model.pose import Array, matrix_from_rotation_vector, read_only
 from model.rig import Rig, load_rig
 from model.winches import WinchMap
