@@ -10,7 +10,7 @@ narrow. Where the stiffness is among the parameters, its prior counts too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
@@ -249,7 +249,9 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
                 " outliers in the report's list of poses",
             )
         )
-    if after > before:
+    worse = math.sqrt(max(after**2 - before**2, 0.0))
+    # A fit to noise is worse than a rig file that is right, by no more than the fit states.
+    if worse > max(level, rotated):
         issues.append(
             Issue(
                 f"the rig file without calibration fits better ({before * 1e3:.2g} mm)",
@@ -281,6 +283,12 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     verdict = CalibrationVerdict.of(
         error, wanted, f"rotated by up to {math.degrees(tilt):.3g}°", issues
     )
+    if verdict.good and after >= before:
+        step = (
+            f"keep the rig file: with it, held-out samples are {before * 1e3:.2g} mm off, with this"
+            f" calibration {after * 1e3:.2g} mm (RMS)"
+        )
+        verdict = replace(verdict, next_steps=(step,))
     return RigQuality(verdict, before, after, level, rotated, tilt)
 
 
