@@ -210,7 +210,7 @@ class RigCalibration:
             return None
         return float(np.sqrt(np.mean(self.uncertainty.half_widths[columns] ** 2)))
 
-    def position_errors(self, positions: Array, rotations: Array) -> tuple[Array, Array]:
+    def position_errors(self, positions: Array, rotations: Array) -> tuple[Array, Array, Array]:
         """Position errors of the platform at commanded poses, 95 %.
 
         Args:
@@ -218,14 +218,18 @@ class RigCalibration:
             rotations: ``world_from_platform``, shape (k, 3, 3).
 
         Returns:
-            As by `RigUncertainty.worst`, and the part that errors common to all measured poses
-            cause, shape (k,) both, [m].
+            As by `RigUncertainty.worst`, and the parts that errors common to all measured poses
+            and errors of measured tensions cause, shape (k,) each, [m].
         """
         there = _sent_to(self.rig, positions, rotations)
         line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
         moved = -np.linalg.pinv(line.by_pose) @ line.by_values
-        by_values, uncertainty = moved[:, :3], self.uncertainty
-        return uncertainty.worst(by_values), uncertainty.worst_by_common(by_values)
+        by_values, found = moved[:, :3], self.uncertainty
+        return (
+            found.worst(by_values),
+            found.worst_by_common(by_values),
+            found.worst_by_tensions(by_values),
+        )
 
     def reached(self, positions: Array, rotations: Array) -> Array:
         """Positions that the platform reaches when the rig file's parameters command poses.

@@ -93,7 +93,7 @@ def test_a_common_error_that_is_not_stated_is_in_no_interval(rig: Rig) -> None:
 def test_a_common_displacement_of_a_millimetre_is_not_good_for_one(rig: Rig) -> None:
     """The platform is where the measured poses say, displaced by all of it."""
     found, _ = calibrated(rig, 0, "shift")
-    level, common = found.position_errors(*workspace_poses(rig, 0.0))
+    level, common, _ = found.position_errors(*workspace_poses(rig, 0.0))
     assert common == pytest.approx(2.8 * LENGTH, rel=0.05)  # 95 % of three equal axes
     assert np.all(level > common)
     verdict = judge_rig(found, LENGTH, np.radians(5.0)).verdict
