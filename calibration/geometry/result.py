@@ -27,6 +27,7 @@ class RigResult(ResultDocument):
     """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
 
     order: ClassVar[int] = 3
+    is_of_named_part: ClassVar[bool] = False
 
     kind: Literal["rig"] = "rig"
     outlets_mm: list[Vector]
