@@ -201,13 +201,13 @@ class Comparison:
 
 
 def compare(first: ResultDocument, second: ResultDocument) -> Comparison:
-    """Compares two results of one kind and name.
+    """Compares two results of one kind and part; those of a whole rig may have any names.
 
     Raises:
-        BadInput: They differ in kind or name.
+        BadInput: They differ in kind or part.
     """
     require_types((first, ResultDocument), (second, ResultDocument))
-    if (first.kind, first.name) != (second.kind, second.name):
+    if first.kind != second.kind or (first.is_of_named_part and first.name != second.name):
         raise BadInput(
             f"a result of kind {first.kind} for {first.name!r} cannot be compared with one of kind"
             f" {second.kind} for {second.name!r}",

@@ -105,6 +105,8 @@ class ResultDocument(Document, ABC):
 
     order: ClassVar[int]
     """Results of lower order are applied first: those of higher order depend on them."""
+    is_of_named_part: ClassVar[bool] = True
+    """Whether `name` is that of a part of the rig: results of others cannot be compared."""
 
     schema_version: Literal[1] = 1
     kind: str

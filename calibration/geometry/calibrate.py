@@ -6,13 +6,16 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 
-from calibration.geometry.fit import RigFit, poses_from_lengths
+from calibration.geometry.fit import RigFit
 from calibration.geometry.identifiability import (
+    HeldOut,
     Observability,
     RigUncertainty,
+    held_out,
     identified,
     pose_scales,
     sentences,
@@ -24,7 +27,7 @@ from calibration.geometry.parameters import Parameters, RigGeometry, rig_with
 from calibration.statistics import Interval
 from model.errors import BadInput
 from model.kinematics import cables_to, poses_near
-from model.pose import Array, read_only
+from model.pose import Array, matrix_from_rotation_vector, read_only
 from model.rig import Rig
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
@@ -82,63 +85,7 @@ def _misfits(fit: RigFit, residuals: Array, measured: RigMeasurements) -> Array:
     return misfits
 
 
-# Cross-validation: errors on held-out samples.
-
-
-FOLDS = 5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HeldOut:
-    """Cross-validation errors of samples.
-
-    Attributes:
-        before: Errors with the rig file, shape (n,), [m].
-        after: Errors with fits that left the sample out, shape (n,), [m].
-        poses: True for position errors; False for RMS cable residuals, without measured poses.
-    """
-
-    before: Array
-    after: Array
-    poses: bool
-
-
-def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation: float) -> HeldOut:
-    """Five-fold cross-validation.
-
-    Args:
-        parameters: The unknowns.
-        measured: Stationary samples.
-        length_deviation: Of a cable's length from the encoder, [m].
-
-    Raises:
-        Fault: A part of the measurements cannot be fitted.
-    """
-    n = len(measured)
-    posed = bool(measured.has_position.all())
-    before, after = np.empty(n), np.empty(n)
-    zero = np.zeros(len(parameters))
-    for fold in range(FOLDS):
-        out = np.arange(n) % FOLDS == fold
-        rest, left_out = measured.part(~out), measured.part(out)
-        fit, _ = identified(parameters, rest, length_deviation)
-        for errors, values in ((before, zero), (after, fit.values)):
-            errors[out] = _errors(parameters, values, left_out, posed)
-    return HeldOut(before, after, posed)
-
-
-def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
-    """Errors of held-out samples, shape (n,), [m]."""
-    model, geometry = RigModel(parameters, measured), parameters.geometry(values)
-    lengths, rig = model.counted.lengths(geometry), rig_with(parameters.rig, geometry)
-    if not posed:
-        found = poses_from_lengths(rig, lengths, measured.without_poses(), alone=True)
-        apart = model.residuals(values, *found)[:, : rig.cable_count]
-        return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
-    rotations = measured.first_rotations(rig)
-    found = poses_near(rig, lengths, measured.origins(rotations), rotations, steps=8)[:2]
-    apart = measured.measured_points(*found) - measured.positions
-    return np.asarray(np.linalg.norm(apart, axis=1))
+# The calibration.
 
 
 FEWEST_SAMPLES = 10
@@ -263,7 +210,7 @@ class RigCalibration:
             return None
         return float(np.sqrt(np.mean(self.uncertainty.half_widths[columns] ** 2)))
 
-    def position_errors(self, positions: Array, rotations: Array) -> tuple[Array, Array]:
+    def position_errors(self, positions: Array, rotations: Array) -> tuple[Array, Array, Array]:
         """Position errors of the platform at commanded poses, 95 %.
 
         Args:
@@ -271,14 +218,18 @@ class RigCalibration:
             rotations: ``world_from_platform``, shape (k, 3, 3).
 
         Returns:
-            As by `RigUncertainty.worst`, and the part that errors common to all measured poses
-            cause, shape (k,) both, [m].
+            As by `RigUncertainty.worst`, and the parts that errors common to all measured poses
+            and errors of measured tensions cause, shape (k,) each, [m].
         """
         there = _sent_to(self.rig, positions, rotations)
         line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
         moved = -np.linalg.pinv(line.by_pose) @ line.by_values
-        by_values, uncertainty = moved[:, :3], self.uncertainty
-        return uncertainty.worst(by_values), uncertainty.worst_by_common(by_values)
+        by_values, found = moved[:, :3], self.uncertainty
+        return (
+            found.worst(by_values),
+            found.worst_by_common(by_values),
+            found.worst_by_tensions(by_values),
+        )
 
     def reached(self, positions: Array, rotations: Array) -> Array:
         """Positions that the platform reaches when the rig file's parameters command poses.
@@ -431,4 +382,32 @@ def _sent_to(rig: Rig, positions: Array, rotations: Array) -> RigMeasurements:
         positions=positions,
         rotations=rotations,
         covariances=np.zeros((len(positions), 6, 6)),
+    )
+
+
+_INSET = 0.15
+"""The workspace is assessed at its centre and this share inside its corners."""
+
+
+def workspace_poses(rig: Rig, tilt: float) -> tuple[Array, Array]:
+    """Poses at the centre and near the corners of the workspace, rotated about ±x and ±y.
+
+    Args:
+        rig: As in its file.
+        tilt: Angle of rotation, [rad]; 0 for the orientation of home only.
+
+    Returns:
+        Positions, shape (k, 3), [m], and rotations, shape (k, 3, 3).
+    """
+    centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
+    half = (0.5 - _INSET) * (rig.workspace_upper - rig.workspace_lower)
+    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
+    positions = centre + np.concatenate([np.zeros((1, 3)), corners])
+    axes = [(1, 0), (-1, 0), (0, 1), (0, -1)] if tilt else [(0, 0)]
+    turns = [matrix_from_rotation_vector((tilt * x, tilt * y, 0.0)) for x, y in axes]
+    rotations = np.array(turns) @ rig.home.rotation
+    pairs = list(product(range(len(positions)), range(len(rotations))))
+    return (
+        np.array([positions[i] for i, _ in pairs]),
+        np.array([rotations[j] for _, j in pairs]),
     )

@@ -115,6 +115,8 @@ class RigFit:
         scores: Half the gradient of each sample's squares by the unknowns, same units, (n, p).
         common_scores: Change of the sum of these by one deviation of each error common to all
             poses, shape (p, q).
+        tension_squares: Growth of the expected sum of squares, poses eliminated, by independent
+            tension errors of each cable with a variance of 1 N², shape (m,).
     """
 
     values: Array
@@ -128,6 +130,7 @@ class RigFit:
     informations: Array
     scores: Array
     common_scores: Array
+    tension_squares: Array
 
     @property
     def cables(self) -> Array:
@@ -281,12 +284,24 @@ class RigFitter:
             ),
             *system.reduced_by_sample(),
             self._common_scores(system, positions, rotations),
+            self._tension_squares(system, values, positions, rotations),
         )
 
     def _common_scores(self, system: NormalEquations, positions: Array, rotations: Array) -> Array:
         """As in `RigFit`; an error of a measured pose pulls the estimated one along."""
         pulls = self._pose_weights(positions, rotations) @ self._measured.common_errors
         return np.asarray(np.sum(system.mixed @ np.linalg.solve(system.poses, pulls), axis=0))
+
+    def _tension_squares(
+        self, system: NormalEquations, values: Array, positions: Array, rotations: Array
+    ) -> Array:
+        """As in `RigFit`; poses follow a part of the errors."""
+        line = self._model.linearised(values, positions, rotations)
+        weights = self._weights(line.residuals) / self._deviations**2
+        followed = line.by_pose @ np.linalg.solve(system.poses, np.swapaxes(line.by_pose, 1, 2))
+        left = weights - weights**2 * np.einsum("nkk->nk", followed)
+        by_tension = self._model.counted.by_tension(self._parameters.geometry(values))
+        return np.asarray(np.sum(left[:, : by_tension.shape[1]] * by_tension**2, axis=0))
 
 
 # Poses whose rotation was not measured, from cable lengths.

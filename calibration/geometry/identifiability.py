@@ -1,4 +1,4 @@
-"""Which directions of a rig's parameters the data determine, and names for the others.
+"""Which directions of a rig's parameters the data determine, and the errors of a fit in them.
 
 Information of the data is relative to that of the rig file: along an eigenvector with a value above
 1 the data are more accurate. The others cannot be identified and are left as in the rig file.
@@ -11,10 +11,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibration.geometry.fit import POSE_BEND, RigFit, RigFitter
+from calibration.geometry.fit import POSE_BEND, RigFit, RigFitter, poses_from_lengths
 from calibration.geometry.measurements import RigMeasurements
-from calibration.geometry.parameters import AXES, Parameters
+from calibration.geometry.model import RigModel, tension_variance
+from calibration.geometry.parameters import AXES, Parameters, rig_with
 from calibration.statistics import huber_weight, rms_bound, student_factor
+from model.kinematics import poses_near
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
@@ -226,7 +228,21 @@ def pose_scales(measured: RigMeasurements, fit: RigFit, observability: Observabi
 # The rig file acts as a prior that is never left out. Neither shows errors that all measured poses
 # share, such as of the camera's pose: the fit follows them, and what it does is added to both.
 #
-# Source: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11.
+# A measured tension multiplies the compliance, so its random errors do not only scatter: they make
+# the compliance too small (attenuation). Such an error is in the residual and in its derivative by
+# the logarithm of the stiffness, with the same factor: the expected gradient is the growth of the
+# squares. That growth is the larger of two: what the scatter of the force on the platform implies,
+# and the excess of residuals over what is stated, but no more than all residuals. Both may have
+# other causes: that tensions cause all of it, or nothing, is taken as equally likely.
+#
+# Sources: Efron & Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 11; Fuller,
+# "Measurement Error Models", 1987, section 1.1.
+
+
+ALL_OR_NONE = 0.5**0.5
+"""RMS of a bias that is as likely there as not, relative to the bias."""
+LEAST_SHARE = 0.5
+"""Errors of tensions are not taken to reduce a compliance to less than this share."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,6 +254,10 @@ class RigUncertainty:
         by_jackknife: The same, from leaving out each sample.
         common: Changes of the unknowns by one deviation of each error common to all measured
             poses, shape (p, q); no scatter shows them.
+        by_tensions: Changes of the unknowns by one deviation of the bias that errors of measured
+            tensions cause, shape (p, 1).
+        tension_squares: Part of the squares of residuals that errors of each cable's tensions may
+            cause, shape (m,).
         scatter: Ratio of the variance of residuals and measured poses to the stated one, at
             least 1.
         quantile: Half width of a 95 % interval in standard deviations.
@@ -246,6 +266,8 @@ class RigUncertainty:
     by_scatter: Array
     by_jackknife: Array
     common: Array
+    by_tensions: Array
+    tension_squares: Array
     scatter: float
     quantile: float
 
@@ -270,13 +292,59 @@ class RigUncertainty:
             for covariance in (self.by_scatter, self.by_jackknife)
         ]
         alone = self.quantile * np.sqrt(np.maximum(*variances))
-        return np.asarray(np.hypot(alone, self.worst_by_common(slopes)))
+        biased = _bounds(slopes, np.hstack([self.common, self.by_tensions]))
+        return np.asarray(np.hypot(alone, biased))
 
     def worst_by_common(self, slopes: Array) -> Array:
         """The part of `worst` that errors common to all poses cause, shape (k,)."""
-        unit = np.eye(self.common.shape[1])
-        bounds = [rms_bound(unit, slope @ self.common) for slope in slopes]
-        return np.asarray(np.sqrt(slopes.shape[1]) * np.array(bounds))
+        return _bounds(slopes, self.common)
+
+    def worst_by_tensions(self, slopes: Array) -> Array:
+        """The part of `worst` that errors of measured tensions cause, shape (k,)."""
+        return _bounds(slopes, self.by_tensions)
+
+
+def _bounds(slopes: Array, changes: Array) -> Array:
+    """95 % bounds on vectors, from changes of the unknowns by one deviation each, shape (k,)."""
+    unit = np.eye(changes.shape[1])
+    bounds = [rms_bound(unit, slope @ changes) for slope in slopes]
+    return np.asarray(np.sqrt(slopes.shape[1]) * np.array(bounds))
+
+
+def tension_scores(parameters: Parameters, squares: Array) -> Array:
+    """Half the gradient of squares by errors of measured tensions, shape (p,).
+
+    Args:
+        parameters: The unknowns; in their deviations.
+        squares: Growth of each cable's squares by these errors, shape (m,).
+    """
+    scores, slices = np.zeros(len(parameters)), parameters.slices()
+    if "stiffness" in slices:
+        scores[slices["stiffness"]] = squares.sum()
+    if "cable_stiffness" in slices:
+        scores[slices["cable_stiffness"]] = squares
+    return np.asarray(scores * parameters.deviations)
+
+
+def _tension_squares(
+    parameters: Parameters,
+    measured: RigMeasurements,
+    fit: RigFit,
+    observability: Observability,
+    ratio: float,
+) -> Array:
+    """As in `RigUncertainty`; ``ratio`` of the variance of residuals to the stated one."""
+    numbers, known = _numbers(measured, fit), observability.known
+    at = (parameters.geometry(fit.values), measured, fit.positions, fit.rotations)
+    by_statics = tension_variance(parameters.rig, *at) * fit.tension_squares
+    # They are those of the reduced compliance.
+    whole = known.T @ fit.information @ known + np.eye(known.shape[1])
+    scores = known.T @ tension_scores(parameters, by_statics)
+    moved = parameters.deviations * (known @ np.linalg.solve(whole, scores))
+    reduced = [moved[k] for k, n in enumerate(parameters.names) if n.startswith("stiffness")]
+    by_statics /= max(1.0 - max(reduced, default=0.0), LEAST_SHARE)
+    share = min(max(float(by_statics.sum()) / numbers, ratio - 1.0), ratio)
+    return read_only(share * numbers * fit.tension_squares / fit.tension_squares.sum())
 
 
 def uncertainty_of_rig(
@@ -299,8 +367,10 @@ def uncertainty_of_rig(
     scores = fit.scores @ known
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
     of_poses = float(np.sum(huber_weight(fit.pose_misfits, POSE_BEND) * fit.pose_misfits**2))
-    freedom = _numbers(measured, fit) - known.shape[1]
-    scatter = max(1.0, (_residual_squares(fit) + of_poses) / max(freedom, 1))
+    numbers = _numbers(measured, fit)
+    freedom = numbers - known.shape[1]
+    found = (_residual_squares(fit) + of_poses) / max(freedom, 1)
+    scatter = max(1.0, found)
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]
     apart = without - without.mean(axis=0)
@@ -314,5 +384,67 @@ def uncertainty_of_rig(
     by_scatter, by_jackknife = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
     pulled = known @ np.linalg.solve(whole, known.T @ fit.common_scores)
     common = read_only(-spread[:, None] * pulled)
+    squares = _tension_squares(parameters, measured, fit, observability, found)
+    biased = np.linalg.solve(whole, known.T @ tension_scores(parameters, squares))
+    by_tensions = read_only(-ALL_OR_NONE * (spread * (known @ biased))[:, None])
     quantile = student_factor(count - 1)
-    return RigUncertainty(by_scatter, by_jackknife, common, scatter, quantile)
+    return RigUncertainty(by_scatter, by_jackknife, common, by_tensions, squares, scatter, quantile)
+
+
+# Cross-validation: errors on held-out samples.
+
+
+FOLDS = 5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeldOut:
+    """Cross-validation errors of samples.
+
+    Attributes:
+        before: Errors with the rig file, shape (n,), [m].
+        after: Errors with fits that left the sample out, shape (n,), [m].
+        poses: True for position errors; False for RMS cable residuals, without measured poses.
+    """
+
+    before: Array
+    after: Array
+    poses: bool
+
+
+def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation: float) -> HeldOut:
+    """Five-fold cross-validation.
+
+    Args:
+        parameters: The unknowns.
+        measured: Stationary samples.
+        length_deviation: Of a cable's length from the encoder, [m].
+
+    Raises:
+        Fault: A part of the measurements cannot be fitted.
+    """
+    n = len(measured)
+    posed = bool(measured.has_position.all())
+    before, after = np.empty(n), np.empty(n)
+    zero = np.zeros(len(parameters))
+    for fold in range(FOLDS):
+        out = np.arange(n) % FOLDS == fold
+        rest, left_out = measured.part(~out), measured.part(out)
+        fit, _ = identified(parameters, rest, length_deviation)
+        for errors, values in ((before, zero), (after, fit.values)):
+            errors[out] = _errors(parameters, values, left_out, posed)
+    return HeldOut(before, after, posed)
+
+
+def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, posed: bool) -> Array:
+    """Errors of held-out samples, shape (n,), [m]."""
+    model, geometry = RigModel(parameters, measured), parameters.geometry(values)
+    lengths, rig = model.counted.lengths(geometry), rig_with(parameters.rig, geometry)
+    if not posed:
+        found = poses_from_lengths(rig, lengths, measured.without_poses(), alone=True)
+        apart = model.residuals(values, *found)[:, : rig.cable_count]
+        return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
+    rotations = measured.first_rotations(rig)
+    found = poses_near(rig, lengths, measured.origins(rotations), rotations, steps=8)[:2]
+    apart = measured.measured_points(*found) - measured.positions
+    return np.asarray(np.linalg.norm(apart, axis=1))

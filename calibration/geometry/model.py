@@ -70,6 +70,11 @@ class CountedLengths:
         lengths: Array = unstrained * self.stretch(geometry) - self._behind
         return lengths
 
+    def by_tension(self, geometry: RigGeometry) -> Array:
+        """Derivative of `lengths` by the cables' own tensions, shape (n, m), [m/N]."""
+        unstrained = self.at_home(geometry) + self.paid_out * (1.0 + geometry.drum_scale)
+        return np.asarray(unstrained / geometry.stiffness)
+
     def by_compliance(self, geometry: RigGeometry) -> Array:
         """Derivative of `lengths` by the cables' compliance, 1 / stiffness, shape (n, m), [m N]."""
         at_home = self.at_home(geometry)
@@ -367,7 +372,33 @@ def _by_pulley_radius(rig: Rig, cables: Cables) -> Array:
     return by_radius
 
 
-# Tensions of samples without measured ones, and their uncertainty.
+# Errors of measured tensions, and tensions of samples without measured ones.
+
+
+def tension_variance(
+    rig: Rig, geometry: RigGeometry, measured: RigMeasurements, positions: Array, rotations: Array
+) -> float:
+    """Variance of measured tensions, [N²], by the forces on the platform, which is at rest.
+
+    The force of the cables is that of the weight at every pose: independent errors of tensions
+    scatter it. Moments would show them, too, but errors of the anchors as much.
+
+    Args:
+        rig: As in its file.
+        geometry: The estimated parameters.
+        measured: Stationary samples.
+        positions: Of the platform, world frame, shape (n, 3), [m].
+        rotations: ``world_from_platform``, shape (n, 3, 3).
+
+    Returns:
+        0 where tensions are missing in some samples.
+    """
+    if not np.isfinite(measured.tensions).all():
+        return 0.0
+    directions = RigAtPoses.of(rig, geometry, positions, rotations).cables.directions
+    forces = np.sum(measured.tensions[..., None] * directions, axis=1)
+    squares = np.sum((forces - forces.mean(axis=0)) ** 2)
+    return float(squares) / (rig.cable_count * max(len(measured) - 1, 1))
 
 
 def tension_sigma(rig: Rig) -> float:

@@ -10,18 +10,17 @@ narrow. Where the stiffness is among the parameters, its prior counts too.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.geometry.calibrate import RigCalibration
+from calibration.geometry.calibrate import RigCalibration, workspace_poses
+from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE, tension_scores
 from calibration.geometry.model import RigModel
 from calibration.results import CalibrationVerdict, Issue
 from calibration.statistics import CONFIDENCE
-from model.pose import Array, matrix_from_rotation_vector
-from model.rig import Rig
+from model.pose import Array
 
 CONTRADICTION = 4.0
 """This many standard deviations from the rig file are significant."""
@@ -86,13 +85,13 @@ def estimate_compliance(result: RigCalibration) -> Compliance | None:
     Args:
         result: The fit with the rig file's stiffness.
     """
-    found = _compliance_information(result, np.ones((result.rig.cable_count, 1)))
+    found = _compliance_changes(result, np.ones((result.rig.cable_count, 1)))
     if found is None:
         return None
-    information, pull = found
-    nominal, own = float(_nominal_compliance(result).mean()), float(information[0, 0])
+    (change,), covariance = found
+    nominal = float(_nominal_compliance(result).mean())
     compliance = float(np.mean(1.0 / result.rig.cable_stiffness))
-    change, deviation = -float(pull[0]) / own, own**-0.5
+    deviation = float(covariance[0, 0]) ** 0.5
     return Compliance(nominal * compliance, (nominal + change) * compliance, deviation * compliance)
 
 
@@ -103,12 +102,11 @@ def estimate_cable_compliances(result: RigCalibration) -> CableCompliances | Non
         result: The fit with one stiffness for all cables.
     """
     cables = result.rig.cable_count
-    found = _compliance_information(result, np.eye(cables))
+    found = _compliance_changes(result, np.eye(cables))
     if found is None:
         return None
-    information, pull = found
-    change = -np.asarray(np.linalg.solve(information, pull))
-    chance = float(chdtrc(cables, -pull @ change))
+    change, covariance = found
+    chance = float(chdtrc(cables, change @ np.linalg.solve(covariance, change)))
     estimated: Array = (_nominal_compliance(result) + change) / result.rig.cable_stiffness
     return CableCompliances(estimated, chance)
 
@@ -128,17 +126,17 @@ _ROUND_OFF = 1e-9
 """Information below this share of that with all else known is round-off."""
 
 
-def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Array, Array] | None:
-    """Information on compliances relative to the rig file's, all else eliminated, per variance.
+def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, Array] | None:
+    """Changes of compliances, relative to the rig file's, that the data ask for.
 
     Args:
         result: The fit.
         groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
     Returns:
-        Information, shape (q, q), and half the gradient of the squares, shape (q,); None where
-        tensions are missing in some samples, or the information is round-off, as with six lengths
-        and no pose, which fit any compliance.
+        Changes, shape (q,), and their covariance, shape (q, q), bias by errors of the tensions
+        included; None where tensions are missing in some samples, or the information is round-off,
+        as with six lengths and no pose, which fit any compliance.
     """
     if not np.isfinite(result.measured.tensions).all():
         return None
@@ -162,14 +160,22 @@ def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Arra
     r = free.shape[1]
     with_all_known = np.einsum("nmp,nm,nmp->p", by_compliance, weights, by_compliance)
     information[:r, :r] += np.eye(r)
-    own = information[r:, r:] - information[r:, :r] @ np.linalg.solve(
-        information[:r, :r], information[:r, r:]
-    )
+    by_free = np.linalg.solve(information[:r, :r], information[:r, r:])
+    own = information[r:, r:] - information[r:, :r] @ by_free
     scale = np.sqrt(with_all_known)
     if not scale.all() or np.linalg.eigvalsh(own / np.outer(scale, scale))[0] < _ROUND_OFF:
         return None
     pull = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
-    return own / result.uncertainty.scatter, pull / result.uncertainty.scatter
+    change = -np.asarray(np.linalg.solve(own, pull))
+    covariance = result.uncertainty.scatter * np.linalg.inv(own)
+    # Bias by errors of the tensions, from the squares that these changes leave.
+    squares, nominal = result.uncertainty.tension_squares, _nominal_compliance(result)
+    left = max(1.0 + float(pull @ change) / squares.sum(), 0.0) if squares.any() else 0.0
+    by_share = left * squares / np.maximum(nominal + groups @ change, LEAST_SHARE * nominal)
+    by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
+    free_scores = result.observability.known.T @ tension_scores(parameters, by_logarithm)
+    biased = np.linalg.solve(own, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
+    return change, covariance + np.outer(biased, biased)
 
 
 # The verdict.
@@ -179,14 +185,25 @@ FAR = 5.0
 """Largest credible deviation from the rig file, in stated standard deviations."""
 SCATTERED = 2.0
 """Largest acceptable scatter of a sensor or of measured poses, in stated standard deviations."""
-_INSET = 0.15
-"""The workspace is assessed at its centre and this share inside its corners."""
 _COMMON = (
     "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
     " --pose-mm and --pose-deg, in Python pose_deviations=: all measured poses share it, so more of"
     " them do not help"
 )
 """Next step where errors common to all measured poses are the larger part."""
+_TENSIONS = (
+    "measure tensions with smaller errors (friction, gears), or with the platform rotated, since"
+    " their errors make the cables seem too stiff; or enter a measured stiffness_n in the rig file"
+    " and pass --known stiffness, in Python leave stiffness out of deviations="
+)
+"""Next step where errors of measured tensions are the larger part."""
+
+
+def _shared_cause(error: float, common: float, by_tensions: float) -> str | None:
+    """Next step if an error is mostly shared by all poses; parts as by `position_errors`."""
+    if max(common, by_tensions) ** 2 <= 0.5 * error**2:
+        return None
+    return _COMMON if common > by_tensions else _TENSIONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,7 +252,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         wanted: Required error, 95 %, [m].
         tilt: Largest rotation of the platform from its orientation at home, [rad].
     """
-    (level, level_common), (rotated, rotated_common) = (
+    (level, *level_parts), (rotated, *rotated_parts) = (
         [float(e.max()) for e in result.position_errors(*workspace_poses(result.rig, angle))]
         for angle in (0.0, tilt)
     )
@@ -249,11 +266,13 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         issues.append(
             Issue(
                 f"errors of held-out {what} reach {missed * 1e3:.2g} mm",
-                "calibrate the camera and its pose, and check for worn guides, slack cables and"
-                " outliers in the report's list of poses",
+                "calibrate the camera and its pose, and check for worn guides, slack cables, errors"
+                " of measured tensions and outliers in the report's list of poses",
             )
         )
-    if after > before:
+    worse = math.sqrt(max(after**2 - before**2, 0.0))
+    # A fit to noise is worse than a rig file that is right, by no more than the fit states.
+    if worse > max(level, rotated):
         issues.append(
             Issue(
                 f"the rig file without calibration fits better ({before * 1e3:.2g} mm)",
@@ -264,9 +283,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         issues.append(
             Issue(
                 f"the platform may be {level * 1e3:.2g} mm off between the measured poses",
-                _COMMON
-                if level_common**2 > 0.5 * level**2
-                else "measure at more poses all over the workspace"
+                _shared_cause(level, *level_parts)
+                or "measure at more poses all over the workspace"
                 + ("" if out.poses else ", and with a camera"),
             )
         )
@@ -274,9 +292,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         issues.append(
             Issue(
                 f"rotated by {math.degrees(tilt):.3g}° it may be {rotated * 1e3:.2g} mm off",
-                _COMMON
-                if rotated_common**2 > 0.5 * rotated**2
-                else f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
+                _shared_cause(rotated, *rotated_parts)
+                or f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
                 " (`cdpr calibrate poses` plans it); if it never rotates, pass --tilt-deg 0, in"
                 " Python tilt=0",
             )
@@ -285,6 +302,12 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     verdict = CalibrationVerdict.of(
         error, wanted, f"rotated by up to {math.degrees(tilt):.3g}°", issues
     )
+    if verdict.good and after >= before:
+        step = (
+            f"keep the rig file: with it, held-out samples are {before * 1e3:.2g} mm off, with this"
+            f" calibration {after * 1e3:.2g} mm (RMS)"
+        )
+        verdict = replace(verdict, next_steps=(step,))
     return RigQuality(verdict, before, after, level, rotated, tilt)
 
 
@@ -406,27 +429,3 @@ def _pose_issues(result: RigCalibration) -> list[Issue]:
         )
         if times > SCATTERED
     ]
-
-
-def workspace_poses(rig: Rig, tilt: float) -> tuple[Array, Array]:
-    """Poses at the centre and near the corners of the workspace, rotated about ±x and ±y.
-
-    Args:
-        rig: As in its file.
-        tilt: Angle of rotation, [rad]; 0 for the orientation of home only.
-
-    Returns:
-        Positions, shape (k, 3), [m], and rotations, shape (k, 3, 3).
-    """
-    centre = (rig.workspace_lower + rig.workspace_upper) / 2.0
-    half = (0.5 - _INSET) * (rig.workspace_upper - rig.workspace_lower)
-    corners = np.array(list(product((-1.0, 1.0), repeat=3))) * half
-    positions = centre + np.concatenate([np.zeros((1, 3)), corners])
-    axes = [(1, 0), (-1, 0), (0, 1), (0, -1)] if tilt else [(0, 0)]
-    turns = [matrix_from_rotation_vector((tilt * x, tilt * y, 0.0)) for x, y in axes]
-    rotations = np.array(turns) @ rig.home.rotation
-    pairs = list(product(range(len(positions)), range(len(rotations))))
-    return (
-        np.array([positions[i] for i, _ in pairs]),
-        np.array([rotations[j] for _, j in pairs]),
-    )

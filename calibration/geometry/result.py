@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal, Self
 import numpy as np
 from pydantic import Field
 
-from calibration.geometry.calibrate import RigCalibration
-from calibration.geometry.quality import RigQuality, workspace_poses
+from calibration.geometry.calibrate import RigCalibration, workspace_poses
+from calibration.geometry.quality import RigQuality
 from calibration.results import ResultDocument, common_keys
 from calibration.statistics import Interval
 from model.errors import BadInput, Fault
@@ -27,6 +27,7 @@ class RigResult(ResultDocument):
     """Outlets, anchors, pulleys, winches and cables' stiffness, in the keys of the rig file."""
 
     order: ClassVar[int] = 3
+    is_of_named_part: ClassVar[bool] = False
 
     kind: Literal["rig"] = "rig"
     outlets_mm: list[Vector]

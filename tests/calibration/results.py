@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from datetime import date
 
+from calibration.geometry.result import RigResult
 from calibration.intrinsics.result import CameraResult
 from calibration.results import CalibrationVerdict, common_keys
 from calibration.statistics import Interval
@@ -27,4 +28,30 @@ def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -
         covered=0.9,
         pictures_used=20,
         view_errors_px={"b.png": 0.1},
+    )
+
+
+def rig_result_of(name: str = "rig") -> RigResult:
+    verdict = CalibrationVerdict.of(0.4e-3, 1e-3, "rotated by up to 5°", [])
+    intervals = {"outlet_1_x_mm": Interval(1.0, 0.5)}
+    return RigResult(
+        **common_keys(name, date(2026, 3, 1), "ab" * 32, intervals, verdict, {}, {"outlets": 1}),
+        outlets_mm=[[1.0, 0.0, 0.0]],
+        anchors_mm=[[0.0, 0.0, 0.0]],
+        pulley_radius_mm=None,
+        drums_mm_per_rev=[300.0],
+        stiffness_n=6e4,
+        home_counts=[0.0],
+        groups=["outlets"],
+        not_identified=[],
+        information=[2.0],
+        places=20,
+        with_poses=True,
+        held_out_mm=0.2,
+        before_mm=1.0,
+        level_mm=0.3,
+        turned_mm=0.4,
+        tilt_deg=5.0,
+        reached_mm=[[0.0, 0.0, 100.0]],
+        cable_residuals_mm=[0.1],
     )

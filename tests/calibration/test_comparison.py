@@ -14,7 +14,7 @@ from calibration.intrinsics.result import CameraResult, camera_result
 from calibration.result_files import _apart, compare
 from calibration.statistics import Interval
 from model.errors import BadInput
-from tests.calibration.results import camera_result_of
+from tests.calibration.results import camera_result_of, rig_result_of
 from tests.calibration.test_lens_models import SIZE, views
 
 
@@ -71,6 +71,14 @@ def fisheye_result(seed: int) -> CameraResult:
 def test_results_of_different_things_are_refused() -> None:
     with pytest.raises(BadInput, match=r"for 'front' cannot be compared with .* 'side'"):
         compare(camera_result_of(), camera_result_of("side"))
+
+
+def test_results_of_a_rig_are_compared_whatever_their_names() -> None:
+    """Two of one day need two names in a folder."""
+    first = rig_result_of()
+    assert compare(first, first.model_copy(update={"name": "after"})).agree
+    with pytest.raises(BadInput, match="different rig files"):
+        compare(first, first.model_copy(update={"name": "after", "rests_on": "sha256:other"}))
 
 
 def test_results_for_pictures_of_different_sizes_are_refused() -> None:

@@ -15,7 +15,12 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from calibration.geometry.calibrate import RigCalibration, _require_within, fit_rig
+from calibration.geometry.calibrate import (
+    RigCalibration,
+    _require_within,
+    fit_rig,
+    workspace_poses,
+)
 from calibration.geometry.fit import RigFitter
 from calibration.geometry.identifiability import (
     Observability,
@@ -40,7 +45,6 @@ from calibration.geometry.quality import (
     estimate_cable_compliances,
     estimate_compliance,
     judge_rig,
-    workspace_poses,
 )
 from calibration.geometry.report import number_rows, rig_page
 from calibration.geometry.result import RigResult, require_same_nominal, rig_result

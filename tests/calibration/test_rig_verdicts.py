@@ -1,0 +1,152 @@
+"""Verdicts on a rig's calibration: rigs that were calibrated before, and errors of tensions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibration.geometry.calibrate import RigCalibration, fit_rig, workspace_poses
+from calibration.geometry.identifiability import HeldOut
+from calibration.geometry.measurements import RigMeasurements
+from calibration.geometry.model import tension_variance
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS
+from calibration.geometry.quality import judge_rig
+from model.rig import Rig, load_rig
+from tests.calibration.rig_places import (
+    rig_with_errors,
+    samples,
+    share_inside,
+    true_numbers,
+    with_nominal_stiffness,
+)
+from tests.calibration.synthetic_rig import LENGTH_NOISE, BuiltRig, built_rig, measured, only
+
+TILT = float(np.radians(5.0))
+CONFIGS = Path(__file__).parents[2] / "configs"
+SEEDS = (20, 21, 23)
+Sample = tuple[Rig, RigMeasurements]
+KNOWN_STIFFNESS = {g: x for g, x in DEFAULT_DEVIATIONS.items() if g != "stiffness"}
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return load_rig(CONFIGS / "hall_10_6.yaml")
+
+
+@pytest.fixture(scope="module")
+def level() -> list[Sample]:
+    """Rigs of eight cables with tensions of 5 to 36 N, never rotated."""
+    drawn = load_rig(CONFIGS / "gachon_8_6_rehearsal.yaml")
+    built = {seed: rig_with_errors(drawn, seed) for seed in SEEDS}
+    return [(rig, samples(rig, 60, tilt=0.0, seed=10 + s).measured) for s, rig in built.items()]
+
+
+def with_tension_errors(data: RigMeasurements, size: float) -> RigMeasurements:
+    """The measurements with independent errors of the tensions, [N]."""
+    errors = size * np.random.default_rng(7).standard_normal(data.tensions.shape)
+    return replace(data, tensions=data.tensions + errors)
+
+
+def calibrated(
+    rig: Rig, data: RigMeasurements, deviations: Mapping[str, float] = DEFAULT_DEVIATIONS
+) -> RigCalibration:
+    return fit_rig(rig, data, deviations, LENGTH_NOISE)
+
+
+def as_in_its_file(rig: Rig) -> BuiltRig:
+    """A rig that was calibrated before."""
+    off = built_rig(rig, 0).off
+    return BuiltRig(rig, {group: np.zeros_like(values) for group, values in off.items()})
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_rig_as_in_its_file_passes_and_keeps_the_file(rig: Rig, seed: int) -> None:
+    """The check of an earlier calibration with new data: a fit of 66 numbers cannot improve it."""
+    data = only(measured(as_in_its_file(rig), 30, seed))
+    quality = judge_rig(fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_NOISE), 2e-3, TILT)
+    assert quality.held_out > quality.before
+    assert quality.verdict.reasons == ()
+    assert quality.verdict.next_steps[0].startswith("keep the rig file")
+
+
+def test_a_calibration_that_is_worse_than_it_states_is_refused(rig: Rig) -> None:
+    """Held-out samples contradict it by more than its interval."""
+    data = only(measured(as_in_its_file(rig), 30, 1))
+    found = fit_rig(rig, data, DEFAULT_DEVIATIONS, LENGTH_NOISE)
+    stated = judge_rig(found, 2e-3, TILT).rotated
+    for times, refused in ((0.9, False), (1.1, True)):
+        before = found.held_out.before
+        off = HeldOut(before, np.hypot(before, times * stated), poses=True)
+        found.__dict__["held_out"] = off
+        reasons = judge_rig(found, 2e-3, TILT).verdict.reasons
+        assert any("fits better" in reason for reason in reasons) == refused
+
+
+@pytest.mark.parametrize("size", [0.6, 1.0])
+def test_errors_of_tensions_are_in_the_intervals(level: list[Sample], size: float) -> None:
+    """They make the cables seem up to 1.7 times too stiff, which no scatter shows."""
+    all_inside, drums_inside, refused = [], [], []
+    for rig, data in level:
+        found = calibrated(rig, with_tension_errors(data, size))
+        true, stiffness = true_numbers(rig), found.intervals["stiffness_n"]
+        assert stiffness.value > 1.05 * true["stiffness_n"]
+        assert stiffness.bounds[0] < true["stiffness_n"]
+        drums = {name: value for name, value in true.items() if name.startswith("drum")}
+        all_inside.append(share_inside(found.intervals, true))
+        drums_inside.append(share_inside(found.intervals, drums))
+        verdict = judge_rig(found, 1e-3, 0.0).verdict
+        refused.append(not verdict.good)
+        if not verdict.good:
+            assert verdict.next_steps[0].startswith("measure tensions with smaller errors")
+    assert any(refused)
+    assert np.mean(all_inside) >= 0.9
+    assert np.mean(drums_inside) >= 0.85
+
+
+def test_errors_of_tensions_do_not_contradict_a_known_stiffness(
+    level: list[Sample],
+) -> None:
+    inside = []
+    for rig, data in level:
+        found = calibrated(rig, with_tension_errors(data, 1.0), KNOWN_STIFFNESS)
+        true = {n: x for n, x in true_numbers(rig).items() if n != "stiffness_n"}
+        inside.append(share_inside(found.intervals, true))
+        verdict = judge_rig(found, 1e-3, 0.0).verdict
+        assert not any("stiffness" in text for text in verdict.reasons + verdict.next_steps)
+    assert np.mean(inside) >= 0.9
+
+
+def test_errors_of_tensions_do_not_hide_a_wrong_known_stiffness(
+    level: list[Sample],
+) -> None:
+    for factor in (0.4, 2.5):
+        rig, data = level[0]
+        drawn = with_nominal_stiffness(rig, factor * 6000.0)
+        found = calibrated(drawn, with_tension_errors(data, 0.3), KNOWN_STIFFNESS)
+        reasons = judge_rig(found, 1e-3, 0.0).verdict.reasons
+        assert any("the data give a cable stiffness of" in reason for reason in reasons)
+
+
+def test_the_forces_on_the_platform_show_errors_of_tensions(
+    level: list[Sample],
+) -> None:
+    for rig, data in level:
+        for size in (0.0, 0.6):
+            found = calibrated(rig, with_tension_errors(data, size))
+            fit = found.fit
+            at = (found.geometry, found.measured, fit.positions, fit.rotations)
+            assert tension_variance(rig, *at) ** 0.5 == pytest.approx(size, rel=0.15, abs=0.02)
+
+
+def test_without_errors_of_tensions_nothing_is_added(
+    level: list[Sample],
+) -> None:
+    for rig, data in level:
+        found = calibrated(rig, data)
+        errors, _, by_tensions = found.position_errors(*workspace_poses(rig, 0.0))
+        assert np.all(by_tensions < 0.05 * errors)
+        assert judge_rig(found, 1e-3, 0.0).verdict.good
