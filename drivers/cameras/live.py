@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.frame_reader import NOT_OPENED, FrameReader
+from drivers.cameras.frame_reader import NOT_ON_TIME, NOT_OPENED, FrameReader
 from model.errors import (
     BadInput,
     Fault,
@@ -258,6 +258,9 @@ class LiveCamera(FrameSource):
                 "check the cable and `ls -l /dev/video*`, close other programs, or name another"
                 " camera"
             )
+        elif self._reader.lost == NOT_ON_TIME:
+            why = "its images come too unevenly for their times to be known"
+            next_step = "use a cable instead of Wi-Fi, or a fixed exposure"
         else:
             why = "it was unplugged or hangs, its USB bus is too slow, or its lens is covered"
             next_step = "check the cable, then start again"

@@ -165,8 +165,10 @@ def test_a_camera_without_an_image_on_time_is_lost(
 ) -> None:
     monkeypatch.setattr(queue, "clock", lambda: 0.2 * queue._taken + 0.15 * (queue._taken % 2))
     queue.take(round(5 * FROZEN) + 2)
-    with pytest.raises(HardwareMissing, match=f"delivered no image on time for {FROZEN:g} s"):
+    with pytest.raises(HardwareMissing, match=f"delivered no image on time for {FROZEN:g} s") as caught:
         LiveCamera("0", camera, queue.clock)
+    assert "too unevenly" in caught.value.why
+    assert "a cable instead of Wi-Fi, or a fixed exposure" in caught.value.next_step
     assert queue.released
 
 
