@@ -78,7 +78,11 @@ class ArrivalSchedule:
 
     Otherwise it may have waited, until images come evenly and not faster than usual: then none
     waits. So the camera may lose images, or take fewer per second. If it takes more, images are
-    early; that is the new usual interval once they come evenly.
+    early, and on time; that is the new usual interval once they come evenly.
+
+    A network or decoder that delivers fewer images per second than the camera takes looks like a
+    camera that takes fewer: its images count as on time, though they are ever later, also while
+    they catch up.
     """
 
     def __init__(self) -> None:
