@@ -205,14 +205,21 @@ class FrameReader:
         late: Number of images skipped as they may have waited, since the first on time.
     """
 
-    def __init__(self, opened: Callable[[], cv2.VideoCapture], clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        opened: Callable[[], cv2.VideoCapture],
+        clock: Callable[[], float],
+        *,
+        needs_times: bool = True,
+    ) -> None:
         """Starts the thread.
 
         Args:
             opened: Opens the camera, called by the thread: it may take half a minute.
             clock: Monotonic time, [s].
+            needs_times: Skips images that may have waited for an unknown time.
         """
-        self._opened, self._clock = opened, clock
+        self._opened, self._clock, self._needs_times = opened, clock, needs_times
         self._changed = threading.Condition()
         self._newest: Arrived | None = None
         self.lost, self.late = "", 0
@@ -270,7 +277,7 @@ class FrameReader:
             if not good:
                 continue
             time = driver_times.time(now, _stated_time(capture))
-            is_on_time = schedule.is_on_time(now) or time is not None
+            is_on_time = schedule.is_on_time(now) or time is not None or not self._needs_times
             arrived = Arrived(number, now if time is None else time, np.asarray(picture))
             number += 1
             is_copy = last is not None and _is_copy(arrived.picture, last.picture)

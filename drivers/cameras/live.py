@@ -180,13 +180,16 @@ class VideoFile(FrameSource):
 class LiveCamera(FrameSource):
     """A local or network camera that returns its newest image.
 
-    It opens in about two seconds more than the device: its first images may have waited in queues.
+    If times are needed, it opens in about two seconds more than the device: its first images may
+    have waited in queues.
 
     Args:
         source: Index, such as ``0``, device file or address.
         camera: Its description in the rig file.
         clock: Monotonic time, [s].
         stopped: Ends the images when true; called repeatedly while there is none.
+        needs_times: Skips images whose times are unknown, as they may have waited; False for images
+            of something at rest.
 
     Raises:
         HardwareMissing: It does not open or delivers no image.
@@ -200,6 +203,8 @@ class LiveCamera(FrameSource):
         camera: Camera,
         clock: Callable[[], float] = time.monotonic,
         stopped: Callable[[], bool] = lambda: False,
+        *,
+        needs_times: bool = True,
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
         self._stopped, self._seen, self._latency = stopped, False, camera.latency
@@ -217,7 +222,7 @@ class LiveCamera(FrameSource):
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
             return capture
 
-        self._reader = FrameReader(opened, clock)
+        self._reader = FrameReader(opened, clock, needs_times=needs_times)
         # A caller that only iterates does not close it, and the thread must not outlive it.
         self._finalizer = weakref.finalize(self, self._reader.close)
         try:

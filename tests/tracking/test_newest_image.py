@@ -204,6 +204,20 @@ def test_a_camera_without_an_image_on_time_is_lost(
     assert queue.released
 
 
+def test_a_camera_whose_times_are_not_needed_is_used_from_its_first_image(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At rest it does not matter when an image was taken."""
+    monkeypatch.setattr(queue, "clock", lambda: 0.2 * queue._taken + 0.15 * (queue._taken % 2))
+    queue.take(1)
+    with LiveCamera("0", camera, queue.clock, needs_times=False) as live:
+        for number in (5, 400, 900):
+            queue.take(number + 1 - queue._come)
+            queue.wait_until_read()
+            assert live.read().name == f"image {number}"
+        queue.unplug()
+
+
 def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera: Camera) -> None:
     queue.repeats = 100_000
     queue.take(OPENING)
