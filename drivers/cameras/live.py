@@ -66,8 +66,9 @@ class FrameSource:
 
 #: Begin of a file without times, for which FFmpeg assumes 25 images per second: JPEG images one
 #: after the other, also with HTTP headers, or H.264 or H.265 as the encoder delivers it (start code
-#: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there.
-_NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01[\x00-\x7f]")
+#: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there. A
+#: box of an MP4 or MOV file begins with its size in four bytes, which may look like a start code.
+_NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01(?!mdat|.(?:ftyp|moov))[\x00-\x7f]", re.DOTALL)
 
 
 class VideoFile(FrameSource):
