@@ -318,7 +318,7 @@ class _Sample:
 
 
 def _live(source: str, camera: Camera, most: int) -> Iterable[tuple[str, Image]]:
-    with LiveCamera(source, camera) as live:
+    with LiveCamera(source, camera, needs_times=False) as live:
         for _ in range(most):
             frame = live.read()
             yield frame.name, frame.image
@@ -413,5 +413,6 @@ def _frames(
     if path.is_file():
         yield (frame.image for frame in VideoFile(path, generic_camera(video_size(path), source)))
         return
-    with LiveCamera(source, generic_camera(size, source), stopped=stopped) as live:
+    camera = generic_camera(size, source)
+    with LiveCamera(source, camera, stopped=stopped, needs_times=False) as live:
         yield (frame.image for frame in live)

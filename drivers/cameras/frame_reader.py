@@ -3,8 +3,9 @@
 Images wait in queues of the network, the driver and the decoder. A reader slower than the camera
 would measure ever older images, so a thread reads all of them and keeps the last.
 
-After a pause of the network or the computer those that waited come in quick succession. How long
-each waited is unknown, so they are skipped: none gets the present time.
+After a pause of the network or the computer those that waited come in quick succession. If the
+driver states when it received them, it is known how long each waited. Otherwise they are skipped:
+none gets the present time.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ FROZEN = 60.0
 #: Longest wait for the reading thread when closing, and interval of checks for a stop, [s].
 END_TIMEOUT, ROUND = 2.0, 0.1
 NOT_OPENED = "cannot be opened"
+NOT_ON_TIME = f"delivered no image on time for {FROZEN:g} s"
 """Why a camera delivers no images, as a predicate."""
 
 
@@ -36,7 +38,7 @@ class Arrived:
 
     Attributes:
         number: Number of the camera's image from 0, including skipped ones.
-        time: Time of arrival on the reader's clock, [s].
+        time: When it arrived, or would have without waiting, on the reader's clock, [s].
         picture: As the camera delivered it.
     """
 
@@ -45,7 +47,7 @@ class Arrived:
     picture: NDArray[np.generic]
 
 
-# Which images came on time. Their exposures are not known, only when each was read.
+# Which images came on time, if it is unknown when the driver received each, only when it was read.
 
 
 #: Largest lateness of an image on time, [s]: a platform at 20 mm/s moves 1 mm meanwhile. Network,
@@ -55,7 +57,9 @@ TOLERANCE = 0.05
 #: to 5 s of images, which then come as fast as they are decoded, mostly within 1 s.
 START = 2.0
 #: Images come evenly if at least so many intervals, lasting at least so long [s], differ by at most
-#: `TOLERANCE`: a single pause, or an image decoded slowly among ones that waited, is no pace.
+#: twice `TOLERANCE`: a single pause, or an image decoded slowly among ones that waited, is no pace.
+#: With less tolerance no image would be used of a camera at 15 Hz that loses every third image, or
+#: of one at 30 Hz whose images come in threes.
 EVEN_INTERVALS, EVEN_TIME = 3, 0.25
 #: At a shorter share of the usual interval, images that waited are being read. Also so much of the
 #: usual interval counts for each image skipped: the camera may have lost others before.
@@ -74,7 +78,11 @@ class ArrivalSchedule:
 
     Otherwise it may have waited, until images come evenly and not faster than usual: then none
     waits. So the camera may lose images, or take fewer per second. If it takes more, images are
-    early; that is the new usual interval once they come evenly.
+    early, and on time; that is the new usual interval once they come evenly.
+
+    A network or decoder that delivers fewer images per second than the camera takes looks like a
+    camera that takes fewer: its images count as on time, though they are ever later, also while
+    they catch up.
     """
 
     def __init__(self) -> None:
@@ -95,7 +103,7 @@ class ArrivalSchedule:
         is_even = (
             len(intervals) >= EVEN_INTERVALS
             and now - recent[0] >= EVEN_TIME
-            and max(intervals) - min(intervals) <= TOLERANCE
+            and max(intervals) - min(intervals) <= 2.0 * TOLERANCE
         )
         if self._on_time:
             least = DRAINING * self._usual * len(intervals)
@@ -139,25 +147,79 @@ class ArrivalSchedule:
         self._on_time = deque(enumerate(self._recent, self._number + 1 - len(self._recent)))
 
 
+#: The images of this long have the least age in common, [s]; meanwhile two clocks drift apart by a
+#: few milliseconds.
+AGE_TIME = 60.0
+
+
+class DriverTimes:
+    """Times of a camera's images from those that its driver states, on any clock.
+
+    The age of an image is its arrival less its stated time. It is least for images that did not
+    wait, so the excess over the least age of the last `AGE_TIME` is how long an image waited.
+
+    A driver whose times once do not rise states none.
+    """
+
+    def __init__(self) -> None:
+        """Starts without images."""
+        self._begin: float | None = None
+        self._stated, self._is_rising = 0.0, True
+        self._ages: deque[tuple[float, float]] = deque()  # arrivals and ages, both rising
+
+    def time(self, now: float, stated: float) -> float | None:
+        """When an image would have arrived without waiting, later for each image, [s].
+
+        Args:
+            now: Its arrival, [s].
+            stated: Its time on the driver's clock, [s].
+
+        Returns:
+            None if the driver states no times, and for `START` after the first image.
+        """
+        self._begin = now if self._begin is None else self._begin
+        self._is_rising = self._is_rising and stated > self._stated
+        self._stated = stated
+        if not self._is_rising:
+            return None
+        age = now - stated
+        while self._ages and self._ages[-1][1] >= age:
+            self._ages.pop()
+        self._ages.append((now, age))
+        while now - self._ages[0][0] > AGE_TIME:
+            self._ages.popleft()
+        if now - self._begin < START:
+            return None
+        return now - (age - self._ages[0][1])
+
+
 class FrameReader:
     """Opens a camera and reads all its images in a thread.
 
-    Images that waited in a queue are skipped. A copy of the image before is not a new one: noise
-    makes images of a camera differ, but a decoder or driver that hangs may repeat its last one.
+    Images that waited in a queue are skipped, unless the driver states their times. A copy of the
+    image before is not a new one: noise makes images of a camera differ, but a decoder or driver
+    that hangs may repeat its last one.
 
     Attributes:
         lost: Why the camera delivers no more, as a predicate of it.
         late: Number of images skipped as they may have waited, since the first on time.
     """
 
-    def __init__(self, opened: Callable[[], cv2.VideoCapture], clock: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        opened: Callable[[], cv2.VideoCapture],
+        clock: Callable[[], float],
+        *,
+        needs_times: bool = True,
+    ) -> None:
         """Starts the thread.
 
         Args:
             opened: Opens the camera, called by the thread: it may take half a minute.
             clock: Monotonic time, [s].
+            needs_times: Skips images that may have waited for an unknown time.
         """
-        self._opened, self._clock = opened, clock
+        self._opened, self._clock, self._needs_times = opened, clock, needs_times
         self._changed = threading.Condition()
         self._newest: Arrived | None = None
         self.lost, self.late = "", 0
@@ -203,7 +265,8 @@ class FrameReader:
         """Puts each image of a camera until that is lost, or this closed."""
         number = failed = 0
         last: Arrived | None = None
-        schedule, latest, is_used = ArrivalSchedule(), self._clock() + FROZEN, False
+        schedule, driver_times = ArrivalSchedule(), DriverTimes()
+        latest, is_used = self._clock() + FROZEN, False
         self.lost = "" if capture.isOpened() else NOT_OPENED
         while not (self.lost or self._is_closing):
             good, picture = capture.read()
@@ -213,9 +276,10 @@ class FrameReader:
                 self.lost = f"failed to deliver an image {LOST_IMAGES} times in a row"
             if not good:
                 continue
-            arrived = Arrived(number, now, np.asarray(picture))
+            time = driver_times.time(now, _stated_time(capture))
+            is_on_time = schedule.is_on_time(now) or time is not None or not self._needs_times
+            arrived = Arrived(number, now if time is None else time, np.asarray(picture))
             number += 1
-            is_on_time = schedule.is_on_time(now)
             is_copy = last is not None and _is_copy(arrived.picture, last.picture)
             last = last if is_copy else arrived
             self.late += is_used and not is_on_time
@@ -223,13 +287,24 @@ class FrameReader:
                 is_used, latest = True, now + FROZEN
                 self._put(arrived)
             elif now > latest:
-                what = "the same image" if is_copy else "no image on time"
-                self.lost = f"delivered {what} for {FROZEN:g} s"
+                same = f"delivered the same image for {FROZEN:g} s"
+                self.lost = same if is_copy else NOT_ON_TIME
 
     def _put(self, arrived: Arrived) -> None:
         with self._changed:
             self._newest = arrived
             self._changed.notify_all()
+
+
+def _stated_time(capture: cv2.VideoCapture) -> float:
+    """When the driver received the image last read, on its clock, [s]; 0 if it is unknown.
+
+    Source: OpenCV, `modules/videoio/src/cap_v4l.cpp`: the time stamp of the V4L2 buffer. Other
+    interfaces state the position in a stream.
+    """
+    if capture.getBackendName() != "V4L2":
+        return 0.0
+    return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
 
 
 def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.frame_reader import NOT_OPENED, FrameReader
+from drivers.cameras.frame_reader import NOT_ON_TIME, NOT_OPENED, FrameReader
 from model.errors import (
     BadInput,
     Fault,
@@ -66,8 +66,9 @@ class FrameSource:
 
 #: Begin of a file without times, for which FFmpeg assumes 25 images per second: JPEG images one
 #: after the other, also with HTTP headers, or H.264 or H.265 as the encoder delivers it (start code
-#: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there.
-_NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01[\x00-\x7f]")
+#: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there. A
+#: box of an MP4 or MOV file begins with its size in four bytes, which may look like a start code.
+_NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01(?!mdat|.(?:ftyp|moov))[\x00-\x7f]", re.DOTALL)
 
 
 class VideoFile(FrameSource):
@@ -180,13 +181,16 @@ class VideoFile(FrameSource):
 class LiveCamera(FrameSource):
     """A local or network camera that returns its newest image.
 
-    It opens in about two seconds more than the device: its first images may have waited in queues.
+    If times are needed, it opens in about two seconds more than the device: its first images may
+    have waited in queues.
 
     Args:
         source: Index, such as ``0``, device file or address.
         camera: Its description in the rig file.
         clock: Monotonic time, [s].
         stopped: Ends the images when true; called repeatedly while there is none.
+        needs_times: Skips images whose times are unknown, as they may have waited; False for images
+            of something at rest.
 
     Raises:
         HardwareMissing: It does not open or delivers no image.
@@ -200,6 +204,8 @@ class LiveCamera(FrameSource):
         camera: Camera,
         clock: Callable[[], float] = time.monotonic,
         stopped: Callable[[], bool] = lambda: False,
+        *,
+        needs_times: bool = True,
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
         self._stopped, self._seen, self._latency = stopped, False, camera.latency
@@ -217,7 +223,7 @@ class LiveCamera(FrameSource):
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, camera.height)
             return capture
 
-        self._reader = FrameReader(opened, clock)
+        self._reader = FrameReader(opened, clock, needs_times=needs_times)
         # A caller that only iterates does not close it, and the thread must not outlive it.
         self._finalizer = weakref.finalize(self, self._reader.close)
         try:
@@ -258,6 +264,9 @@ class LiveCamera(FrameSource):
                 "check the cable and `ls -l /dev/video*`, close other programs, or name another"
                 " camera"
             )
+        elif self._reader.lost == NOT_ON_TIME:
+            why = "its images come too unevenly for their times to be known"
+            next_step = "use a cable instead of Wi-Fi, or a fixed exposure"
         else:
             why = "it was unplugged or hangs, its USB bus is too slow, or its lens is covered"
             next_step = "check the cable, then start again"

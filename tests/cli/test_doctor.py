@@ -273,6 +273,9 @@ class FakeCapture:
     def set(self, *_: object) -> None:
         """Cameras accept settings and may ignore them."""
 
+    def getBackendName(self) -> str:  # noqa: N802
+        return "FFMPEG"
+
     def read(self) -> tuple[bool, np.ndarray]:
         return True, np.zeros(self.size, dtype=np.uint8)
 

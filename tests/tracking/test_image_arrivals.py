@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
+from math import nan
 from random import Random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.cameras.frame_reader import EVEN_INTERVALS, START, TOLERANCE, ArrivalSchedule
+from drivers.cameras.frame_reader import (
+    AGE_TIME,
+    EVEN_INTERVALS,
+    START,
+    TOLERANCE,
+    ArrivalSchedule,
+    DriverTimes,
+)
 
 RATES = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 60.0, 100.0, 200.0)
 
@@ -74,16 +84,17 @@ def test_no_image_that_waited_gets_the_present_time(
 ) -> None:
     begin = START + (EVEN_INTERVALS + 5) / rate
     recovered = begin + length + 2.0 * (EVEN_INTERVALS + 2) / rate + length + 1.0
+    decoding, jitter = min(0.02, share / rate), min(jitter, 0.2 / rate)
     images = judged(
         at_rate(rate, recovered + 3.0 + 5.0 / rate),
         pause=(begin, begin + length),
-        decoding=min(0.02, share / rate),
-        jitter=min(jitter, 0.2 / rate),
+        decoding=decoding,
+        jitter=jitter,
         places=places,
         seed=seed,
     )
     used = [image for image in images if image.is_on_time]
-    assert max(image.lateness for image in used) <= 2.0 * TOLERANCE
+    assert max(image.lateness for image in used) <= 2.0 * TOLERANCE + decoding + jitter
     after = [image.is_on_time for image in images if image.taken > recovered]
     assert sum(after) >= 0.9 * len(after)
 
@@ -115,6 +126,29 @@ def test_a_camera_that_loses_images_stays_in_use(rate: float) -> None:
     assert sum(used) > 0.5 * len(used)
 
 
+@pytest.mark.parametrize(
+    "exposures",
+    [
+        [k // 2 * 0.2 + k % 2 / 15.0 for k in range(600)],
+        [k / 15.0 for k in range(900) if k % 3],
+    ],
+    ids=["intervals of 67 and 133 ms", "every third image lost at 15 Hz"],
+)
+def test_a_camera_of_two_intervals_is_used(exposures: list[float]) -> None:
+    used = [image.is_on_time for image in judged(exposures, jitter=3e-3) if image.taken > 3.0]
+    assert all(used)
+
+
+@pytest.mark.parametrize("together", [2, 3])
+def test_a_camera_whose_images_come_together_is_used(together: int) -> None:
+    """A USB hub delivers them so; at 30 Hz none waits for more than 67 ms."""
+    schedule, used = ArrivalSchedule(), []
+    for k in range(900):
+        arrival = (k - k % together + together - 1) / 30.0 + 1e-3 * (k % together)
+        used.append(schedule.is_on_time(arrival))
+    assert sum(used[100:]) > 0.9 * len(used[100:])
+
+
 def test_a_camera_of_uneven_images_stays_in_use() -> None:
     """As one on a busy wireless network: what came in time counts."""
     images = judged(at_rate(10.0, 60.0), jitter=0.1)
@@ -128,3 +162,79 @@ def test_the_images_of_a_stalled_reader_are_skipped_until_none_waits() -> None:
     images = judged(at_rate(20.0, 8.0), pause=(5.0, 6.0), decoding=0.01)
     skipped = [image for image in images if not image.is_on_time and image.taken > START + 1.0]
     assert (round(skipped[0].taken, 2), len(skipped)) == (5.0, 30)  # 20 waited
+
+
+@dataclass(frozen=True)
+class Loads:
+    """Times between which reading an image takes longer, as the computer is busy, [s]."""
+
+    begin: float
+    end: float
+    decoding: float
+
+
+def dated(
+    rate: float, seconds: float, loads: list[Loads], *, places: int, offset: float, drift: float
+) -> list[tuple[float, float, float | None]]:
+    """Images of a driver that states their times: exposure, arrival and time as used, [s].
+
+    Its clock has an offset and a drift. A full queue takes no image.
+    """
+    times, queue = DriverTimes(), deque[float]()
+    coming = deque(at_rate(rate, seconds))
+    now, images = 0.0, []
+    while coming or queue:
+        if not queue:
+            now = max(now, coming[0])
+        now += max([0.002] + [one.decoding for one in loads if one.begin <= now < one.end])
+        while coming and coming[0] <= now:
+            taken = coming.popleft()
+            if len(queue) < places:
+                queue.append(taken)
+        taken = queue.popleft()
+        images.append((taken, now, times.time(now, offset + (1.0 + drift) * taken)))
+    return images
+
+
+@given(
+    rate=st.sampled_from(RATES),
+    load=st.builds(Loads, st.floats(2.1, 8.0), st.floats(8.0, 15.0), st.floats(0.0, 3.0)),
+    places=st.sampled_from([4, 10]),
+    offset=st.sampled_from([1.0, 1e5, 1.7e9]),
+    drift=st.floats(-1e-4, 1e-4),
+)
+def test_an_image_that_waited_has_its_time_if_the_driver_states_it(
+    rate: float, load: Loads, places: int, offset: float, drift: float
+) -> None:
+    """A pause, or a computer that is too slow for seconds; none is skipped."""
+    images = dated(rate, 30.0, [load], places=places, offset=offset, drift=drift)
+    used = [(taken, now, time) for taken, now, time in images if time is not None]
+    assert len(used) == sum(now - images[0][1] >= START for _, now, _ in images)
+    assert all(abs(time - taken) < 0.1 for taken, _, time in used)
+    assert all(time <= now for _, now, time in used)
+    assert all(after[2] > before[2] for before, after in pairwise(used))
+
+
+def test_stated_times_are_used_though_images_waited_while_the_camera_opened() -> None:
+    opening = Loads(0.0, 0.01, 3.0)
+    images = dated(20.0, 20.0, [opening], places=10**6, offset=0.5, drift=0.0)
+    assert max(now - taken for taken, now, _ in images) > 2.5
+    assert all(abs(time - taken) < 0.1 for taken, _, time in images if time is not None)
+    assert sum(time is not None for _, _, time in images) > 250
+
+
+def test_the_times_follow_the_clocks() -> None:
+    """After an hour, clocks of 100 ppm differ by 0.4 s."""
+    images = dated(2.0, 3600.0, [], places=4, offset=10.0, drift=-1e-4)
+    assert all(abs(time - now) < 2e-4 * AGE_TIME for _, now, time in images if time is not None)
+
+
+@pytest.mark.parametrize(
+    "stated",
+    [lambda k: 0.0, lambda k: 7.0, lambda k: (k if k < 90 else k - 50) / 30.0 + 1.0, lambda k: nan],
+    ids=["none", "constant", "jumps back", "not a number"],
+)
+def test_times_that_do_not_rise_are_not_used(stated: Callable[[int], float]) -> None:
+    times = DriverTimes()
+    dates = [times.time(k / 30.0, stated(k)) for k in range(300)]
+    assert dates[90:] == [None] * 210

@@ -371,6 +371,9 @@ def test_a_stream_without_times_has_the_camera_s_rate(
         (b"\0\0\1\xba\x44\0", True),  # MPEG program stream
         (b"\0\0\1\xb3\x14\0", True),  # MPEG-2
         (b"\0\0\0\x20ftypisom", True),  # MP4
+        (b"\0\0\1\x14ftypmp42", True),  # of many brands
+        (b"\0\0\1\x0amoov\0\0", True),  # MOV
+        (b"\0\0\0\1mdat\0\0\0\0\1\2", True),  # with a size of 64 bits
         (b"RIFF\0\0\0\0AVI LIST", True),
         (b"\x1a\x45\xdf\xa3\x01\0", True),  # Matroska
         (b"\x47\x40\x11\x10\0", True),  # MPEG transport stream

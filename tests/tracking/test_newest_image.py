@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -30,6 +31,7 @@ class Queue:
     """
 
     repeats = 1
+    backend = "FFMPEG"
 
     def __init__(self, camera: Camera) -> None:
         self._shape = (camera.height, camera.width, 3)
@@ -60,6 +62,14 @@ class Queue:
 
     def set(self, _what: int, _value: float) -> bool:
         return True
+
+    def getBackendName(self) -> str:  # noqa: N802  # as OpenCV has it
+        return self.backend
+
+    def get(self, what: int) -> float:
+        """The time that its driver states is that of the exposure, on a clock of its own."""
+        assert what == cv2.CAP_PROP_POS_MSEC
+        return 1e6 + 10.0 * (self._taken - 1)
 
     def read(self) -> tuple[bool, Any]:
         with self._changed:
@@ -160,14 +170,52 @@ def test_images_that_waited_are_skipped(
         queue.unplug()
 
 
+def test_images_that_waited_have_their_times_if_the_driver_states_them(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The same pause with V4L2: the newest is used, whether it waited or not."""
+    read_at = [k / 100.0 for k in range(300)]
+    read_at += [4.0 + 1e-3 * k for k in range(100)]
+    read_at += [k / 100.0 for k in range(411, 500)]
+    monkeypatch.setattr(queue, "clock", lambda: read_at[max(0, queue._taken - 1)])
+    monkeypatch.setattr(queue, "backend", "V4L2")
+    queue.take(OPENING)
+    with LiveCamera("0", camera, queue.clock) as live:
+        for number in (299, 310, 380, 399):
+            queue.take(number + 1 - queue._come)
+            queue.wait_until_read()
+            frame = live.read()
+            assert (frame.name, frame.time) == (f"image {number}", pytest.approx(number / 100.0))
+        assert live.late == 0
+        queue.unplug()
+
+
 def test_a_camera_without_an_image_on_time_is_lost(
     queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(queue, "clock", lambda: 0.2 * queue._taken + 0.15 * (queue._taken % 2))
     queue.take(round(5 * FROZEN) + 2)
-    with pytest.raises(HardwareMissing, match=f"delivered no image on time for {FROZEN:g} s"):
+    with pytest.raises(
+        HardwareMissing, match=f"delivered no image on time for {FROZEN:g} s"
+    ) as caught:
         LiveCamera("0", camera, queue.clock)
+    assert "too unevenly" in caught.value.why
+    assert "a cable instead of Wi-Fi, or a fixed exposure" in caught.value.next_step
     assert queue.released
+
+
+def test_a_camera_whose_times_are_not_needed_is_used_from_its_first_image(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At rest it does not matter when an image was taken."""
+    monkeypatch.setattr(queue, "clock", lambda: 0.2 * queue._taken + 0.15 * (queue._taken % 2))
+    queue.take(1)
+    with LiveCamera("0", camera, queue.clock, needs_times=False) as live:
+        for number in (5, 400, 900):
+            queue.take(number + 1 - queue._come)
+            queue.wait_until_read()
+            assert live.read().name == f"image {number}"
+        queue.unplug()
 
 
 def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera: Camera) -> None:
