@@ -1,4 +1,4 @@
-"""Platform pose in one image from the squares of its tags, and its acceptance tests.
+"""Platform pose in one image from the squares of its tags.
 
 Geometry decides which squares belong to the platform: another print of a tag may be on a wall, a
 table or a screen. Every square allows two poses of the body; the pose that most squares agree on is
@@ -19,14 +19,24 @@ from model.rig import Camera, Rig, Tag
 from tracking.camera_model import Image, distort_pixels, pixels_of, project_undistorted, rms
 from tracking.detection.detector import Detection
 from tracking.detection.diagnostics import edge_faults
-from tracking.detection.tags import carries_tag, modules_across, tag_corners, view_angle
+from tracking.detection.tags import (
+    agrees_with_modules,
+    carries_tag,
+    modules_across,
+    tag_corners,
+    view_angle,
+)
 from tracking.edges.refine import refine
 from tracking.measurement import (
+    CAUSE,
+    ROTATED,
+    UNSHARP,
     NoPose,
     Observation,
     PoseMeasurement,
     TrackerSettings,
-    largest_deviations,
+    edge_count,
+    rejection_reason,
 )
 from tracking.pnp import (
     BundlePose,
@@ -112,88 +122,10 @@ def _fitting(
     return best
 
 
-# Acceptance tests of a pose.
-
-
 LIKELY_TAG_ERROR = 5e-5
 """Standard deviation of a tag's corners on the platform, where none is stated, [m]."""
-UNCERTAIN = "the position's uncertainty is"
-"""Message about a pose from edges that are too soft, too few or too far away."""
-UNSHARP = "cannot be measured: they are too blurred, or something lies along them"
-"""Message about tags that are decoded, but whose edges are not found."""
-ROTATED = "from the home pose, the limit is"
-"""Message about a platform that is rotated too far to be measured."""
-CONTRADICT = "its tags contradict each other"
-"""Message about tags that are not where the rig file has them."""
-CAUSE = (
-    "compare size_mm (prints are often scaled to the page), id and pose of its tags with the rig"
-    " file"
-)
-"""Likely cause of it."""
-UNEVEN = (
-    "look for something along an edge, a margin cut off, a bent or smudged print, or a wrong lens"
-    " calibration"
-)
-"""Likely cause of edges of one tag that do not fit each other: its size, id and pose are not."""
-
-
-def rejection_reason(
-    limits: TrackerSettings,
-    views: Sequence[TagView],
-    bundle: BundlePose,
-    prior: Pose | None,
-    measured: int,
-    expected: float,
-    elsewhere: Sequence[int],
-) -> str:
-    """Why a pose is rejected; empty when it is accepted.
-
-    Args:
-        limits: Acceptance limits.
-        views: The tags used.
-        bundle: The pose, in the camera frame.
-        prior: Pose expected from camera measurements, in the same frame; it resolves mirror poses.
-        measured: Number of edges found on these tags and on those that were left out.
-        expected: Squared error of an edge with that of the tags on the platform, in variances.
-        elsewhere: Numbers of tags on the platform that are not where the pose puts them.
-    """
-    used, edges = ", ".join(str(view.tag.id) for view in views), _edges(views)
-    if len(elsewhere) >= len(views):
-        others = ", ".join(map(str, elsewhere))
-        return f"{CONTRADICT}: {others} against {used}; {CAUSE}"
-    if bundle.freedom == 0:
-        return f"only {edges} edges of tags {used} are measured: any three fit a pose exactly"
-    left_out = measured - edges
-    misfit = bundle.cost / max(1, bundle.freedom) / expected
-    some_left_out = left_out > limits.left_out_share * measured
-    if misfit > (limits.doubt if some_left_out else limits.contradiction):
-        out = f", with {left_out} of {measured} left out" if left_out else ""
-        what, cause = (f"{CONTRADICT}: the misfit of their edges", CAUSE)
-        if len(views) == 1 and not elsewhere:
-            what, cause = f"the edges of tag {used} form no square: their misfit", UNEVEN
-        return f"{what} is {misfit:.0f} times the expected one{out}; {cause}"
-    if bundle.reprojection > limits.reprojection_px:
-        limit = f"the limit is {limits.reprojection_px:g} px"
-        return f"the reprojection error is {bundle.reprojection:.2f} px, {limit}"
-    is_ambiguous = bundle.second_best_cost - bundle.cost < limits.single_tag_margin
-    if is_ambiguous and not bundle.is_expected(prior):
-        alone = f"tag {used} is" if len(views) == 1 else f"tags {used} in one plane are"
-        return f"only {alone} detected, which allows two poses"
-    largest, _ = largest_deviations(bundle.covariance)
-    if not largest <= limits.position_deviation:
-        doubt = ""
-        if bundle.without_one.any():
-            doubt = f"one of the four edges of tags {used} is wrong, and any may be it: "
-        return (
-            f"{doubt}{UNCERTAIN} {largest * 1e3:.1f} mm,"
-            f" the limit is {limits.position_deviation * 1e3:g} mm"
-        )
-    return ""
-
-
-def _edges(views: Sequence[TagView]) -> int:
-    """Number of measured edges."""
-    return sum(int(view.seen.edges.sum()) for view in views)
+ONE_PRINT = 4.0
+"""Variance of a single tag's shape in that of a careful print: printers scale axes unequally."""
 
 
 class PlatformEstimator:
@@ -292,8 +224,9 @@ class PlatformEstimator:
         if fitted is None:
             return NoPose(time, self._no_fit_reason(views, start), seen)
         faced = [v for v in views if self._faces(v.tag, fitted[1].camera_from_body)]
-        edges = _edges(faced)
+        edges = edge_count(faced)
         views, bundle = fitted
+        bundle = self._certified(image, views, bundle)
         stated = (self._rig.tag_error or 0.0) * self._scale(bundle)
         reprojection = math.hypot(self._settings.reprojection_px, stated)
         limits = replace(self._settings, reprojection_px=reprojection)
@@ -421,6 +354,22 @@ class PlatformEstimator:
             views = [view for view in views if view is not worst]
             displaced += (worst.tag.id,)
         return None
+
+    def _certified(self, image: Image, views: Sequence[TagView], bundle: BundlePose) -> BundlePose:
+        """A pose without doubt about its four edges if they agree with the tag's inner modules.
+
+        Then the print or the lens calibration is inaccurate, and the covariance at least that of
+        the stated error of the tags, or of a careful print.
+        """
+        if len(views) != 1 or not bundle.without_one.any():
+            return bundle
+        (view,) = views
+        corners, family = view.seen.corners, self._rig.tag_family
+        if not agrees_with_modules(image, self._camera, corners, family, view.tag.id):
+            return bundle
+        least = ONE_PRINT * self._expected_error(bundle) / bundle.misfit(bundle.freedom)
+        stated = read_only(bundle.stated * max(1.0, least))
+        return replace(bundle, stated=stated, without_one=np.zeros((6, 6)))
 
     def _measurement(
         self, time: float, views: list[TagView], bundle: BundlePose, status: str

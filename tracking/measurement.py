@@ -1,10 +1,12 @@
-"""Measurement of the platform in one image, and its extrapolation in time."""
+"""Measurement of the platform in one image, its acceptance tests, and its extrapolation in time."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +17,9 @@ from model.pose import (
     read_only,
     rotation_vector_from_matrix,
 )
+
+if TYPE_CHECKING:
+    from tracking.pnp import BundlePose, TagView
 
 MOST_TURN = math.radians(80.0)
 """Largest rotation from the home pose that is measured; wrong poses are mostly beyond it."""
@@ -230,3 +235,85 @@ class FrameRate:
     def text(self, tags: int) -> str:
         """As in `rates`."""
         return rates(self.pictures_per_second, self.measuring_ms, tags)
+
+
+# Acceptance tests of a pose.
+
+
+UNCERTAIN = "the position's uncertainty is"
+"""Message about a pose from edges that are too soft, too few or too far away."""
+UNSHARP = "cannot be measured: they are too blurred, or something lies along them"
+"""Message about tags that are decoded, but whose edges are not found."""
+ROTATED = "from the home pose, the limit is"
+"""Message about a platform that is rotated too far to be measured."""
+CONTRADICT = "its tags contradict each other"
+"""Message about tags that are not where the rig file has them."""
+CAUSE = (
+    "compare size_mm (prints are often scaled to the page), id and pose of its tags with the rig"
+    " file"
+)
+"""Likely cause of it."""
+UNEVEN = (
+    "look for something along an edge, a margin cut off, a bent or smudged print, or a wrong lens"
+    " calibration"
+)
+"""Likely cause of edges of one tag that do not fit each other: its size, id and pose are not."""
+
+
+def rejection_reason(
+    limits: TrackerSettings,
+    views: Sequence[TagView],
+    bundle: BundlePose,
+    prior: Pose | None,
+    measured: int,
+    expected: float,
+    elsewhere: Sequence[int],
+) -> str:
+    """Why a pose is rejected; empty when it is accepted.
+
+    Args:
+        limits: Acceptance limits.
+        views: The tags used.
+        bundle: The pose, in the camera frame.
+        prior: Pose expected from camera measurements, in the same frame; it resolves mirror poses.
+        measured: Number of edges found on these tags and on those that were left out.
+        expected: Squared error of an edge with that of the tags on the platform, in variances.
+        elsewhere: Numbers of tags on the platform that are not where the pose puts them.
+    """
+    used, edges = ", ".join(str(view.tag.id) for view in views), edge_count(views)
+    if len(elsewhere) >= len(views):
+        others = ", ".join(map(str, elsewhere))
+        return f"{CONTRADICT}: {others} against {used}; {CAUSE}"
+    if bundle.freedom == 0:
+        return f"only {edges} edges of tags {used} are measured: any three fit a pose exactly"
+    left_out = measured - edges
+    misfit = bundle.cost / max(1, bundle.freedom) / expected
+    some_left_out = left_out > limits.left_out_share * measured
+    if misfit > (limits.doubt if some_left_out else limits.contradiction):
+        out = f", with {left_out} of {measured} left out" if left_out else ""
+        what, cause = (f"{CONTRADICT}: the misfit of their edges", CAUSE)
+        if len(views) == 1 and not elsewhere:
+            what, cause = f"the edges of tag {used} form no square: their misfit", UNEVEN
+        return f"{what} is {misfit:.0f} times the expected one{out}; {cause}"
+    if bundle.reprojection > limits.reprojection_px:
+        limit = f"the limit is {limits.reprojection_px:g} px"
+        return f"the reprojection error is {bundle.reprojection:.2f} px, {limit}"
+    is_ambiguous = bundle.second_best_cost - bundle.cost < limits.single_tag_margin
+    if is_ambiguous and not bundle.is_expected(prior):
+        alone = f"tag {used} is" if len(views) == 1 else f"tags {used} in one plane are"
+        return f"only {alone} detected, which allows two poses"
+    largest, _ = largest_deviations(bundle.covariance)
+    if not largest <= limits.position_deviation:
+        doubt = ""
+        if bundle.without_one.any():
+            doubt = f"one of the four edges of tags {used} is wrong, and any may be it: "
+        return (
+            f"{doubt}{UNCERTAIN} {largest * 1e3:.1f} mm,"
+            f" the limit is {limits.position_deviation * 1e3:g} mm"
+        )
+    return ""
+
+
+def edge_count(views: Sequence[TagView]) -> int:
+    """Number of measured edges."""
+    return sum(int(view.seen.edges.sum()) for view in views)

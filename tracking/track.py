@@ -22,9 +22,8 @@ from tracking.camera_model import Image, pixels_of
 from tracking.clearance import MeasuredClearance, clearance_of, require_stated_errors
 from tracking.detection.diagnostics import MIRRORED, SOFT, UNMIRROR, diagnose_tags, edge_width
 from tracking.detection.tags import mounted_rotated, tag_corners
-from tracking.estimator import ROTATED, UNCERTAIN, UNSHARP
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
-from tracking.measurement import Observation, PoseMeasurement
+from tracking.measurement import ROTATED, UNCERTAIN, UNSHARP, Observation, PoseMeasurement
 from tracking.pose_log import LoggedImage
 from tracking.shared_errors import PERHAPS_MOVED
 from tracking.tracker import Tracker

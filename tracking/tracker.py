@@ -21,8 +21,10 @@ from tracking.detection.detector import (
     region_around,
 )
 from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored
-from tracking.estimator import CAUSE, UNEVEN, PlatformEstimator
+from tracking.estimator import PlatformEstimator
 from tracking.measurement import (
+    CAUSE,
+    UNEVEN,
     NoPose,
     Observation,
     PoseMeasurement,

@@ -14,8 +14,7 @@ from tests.tracking.tag_images import small_camera
 from tracking.camera_model import distort_pixels, project_undistorted, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.estimator import rejection_reason
-from tracking.measurement import TrackerSettings
+from tracking.measurement import TrackerSettings, rejection_reason
 from tracking.pnp import (
     BundlePose,
     Squares,

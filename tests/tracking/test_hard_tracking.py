@@ -18,8 +18,8 @@ from tests.tracking.test_tracker import error_of
 from tracking.camera_model import Image, pixels_of
 from tracking.detection.detector import TagDetector
 from tracking.detection.tags import tag_corners
-from tracking.estimator import PlatformEstimator, find_consensus, rejection_reason
-from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings, predict
+from tracking.estimator import PlatformEstimator, find_consensus
+from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings, predict, rejection_reason
 from tracking.pnp import TagView, solve_pnp
 from tracking.rolling_shutter import RecentMotion
 from tracking.track import NoPlatformSeen, track
@@ -440,3 +440,26 @@ def test_three_edges_of_a_lone_tag_give_no_pose(rig: Rig, camera: Camera, empty:
     views = [TagView(view.tag, seen)]
     reason = rejection_reason(TrackerSettings(), views, bundle, None, 3, 1.0, [])
     assert reason == "only 3 edges of tags 301 are measured: any three fit a pose exactly"
+
+
+def test_a_lone_tag_of_an_ordinary_print_is_measured(
+    rig: Rig, camera: Camera, empty: Scene
+) -> None:
+    """Without one edge such a print is centimetres off, but its modules are where its edges are."""
+    (one, close), rng = near_tag(rig, camera), np.random.default_rng(3)
+    surprise = []
+    for number in range(12):
+        turn = matrix_from_rotation_vector(np.radians(rng.uniform(-30.0, 30.0, 3)))
+        truth = Pose(rng.uniform([-0.03, -0.03, 0.415], [0.03, 0.03, 0.475]), turn)
+        image = SyntheticCamera(one, empty, close, seed=number).render(truth, 0)
+        corners = close.world_from_camera.inverse().compose(truth)
+        drawn = pixels_of(close, corners.apply(tag_corners(one.platform_tags[0])))
+        printed = drawn + rng.normal(0.0, 0.1, (4, 2))  # 0.07 mm
+        warp = cv2.getPerspectiveTransform(drawn.astype(np.float32), printed.astype(np.float32))
+        size = (close.width, close.height)
+        image = cv2.warpPerspective(image, warp, size, borderMode=cv2.BORDER_REPLICATE)
+        found = Tracker(one, close).observe(image, 0.0)
+        assert isinstance(found, PoseMeasurement)
+        error = error_of(found, truth)
+        surprise.append(error @ np.linalg.solve(found.covariance, error))
+    assert np.median(surprise) < 16.8

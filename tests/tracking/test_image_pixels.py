@@ -17,8 +17,8 @@ from model.rig import Camera, Rig, Tag
 from tracking.camera_model import image_slopes, pixels_of, point_slopes, undistort_pixels
 from tracking.detection.tags import tag_corners
 from tracking.edges.refine import RefinedTag
-from tracking.estimator import PlatformEstimator, find_consensus, rejection_reason
-from tracking.measurement import TrackerSettings
+from tracking.estimator import PlatformEstimator, find_consensus
+from tracking.measurement import TrackerSettings, rejection_reason
 from tracking.pnp import BundlePose, TagView, solve_pnp
 from tracking.rolling_shutter import RecentMotion
 from tracking.shared_errors import CameraMoved, check_camera, require_unmoved_camera

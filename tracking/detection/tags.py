@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from model.errors import BadInput
 from model.files.camera_file import FAMILIES, drawn_upside_down, opencv_dictionary, tags_in
 from model.pose import Array, Pose, matrix_from_rotation_vector
-from model.rig import Tag
-from tracking.camera_model import Image
+from model.rig import Camera, Tag
+from tracking.camera_model import Image, distort_pixels
 
 #: Top left, top right, bottom right, bottom left of the upright image, in half sides.
 CORNER_SIGNS = np.array([[-1.0, 1.0], [1.0, 1.0], [1.0, -1.0], [-1.0, -1.0]])
@@ -278,3 +278,64 @@ def carries_tag(image: Image, corners: Array, family: str, number: int) -> bool:
     seen, wanted = seen - seen.mean(), wanted - wanted.mean()
     size = float(np.linalg.norm(seen) * np.linalg.norm(wanted))
     return size > 0.0 and float(seen @ wanted) > LEAST_KNOWN_CORRELATION * size
+
+
+# Inner modules against edges.
+
+
+#: Samples per module of a rendered tag, and per module of an image, along each axis.
+_DRAWN, _SAMPLED = 16, 6
+#: Blur of a sharp image, [px].
+_BLUR = 0.75
+#: Inner modules agree with an edge within this distance, [px].
+AGREE = 0.3
+
+
+def agrees_with_modules(
+    image: Image, camera: Camera, corners: Array, family: str, number: int
+) -> bool:
+    """Whether the inner modules of a tag are where its edges put them.
+
+    Something along an edge moves that edge, but not the modules. An inaccurate print, or a wrong
+    lens calibration, moves both alike.
+
+    Args:
+        image: Grey image.
+        camera: Its lens.
+        corners: Undistorted intersections of the tag's measured edges, in the order of
+            `CORNER_SIGNS`, shape (4, 2), [px].
+        family: Such as ``tag36h11``.
+        number: Number in the family.
+    """
+    white = official_modules(family, number).astype(np.float32)
+    side = len(white)
+    scale = math.sqrt(abs(cv2.contourArea(corners.astype(np.float32)))) / side
+    plane = np.array([[0, 0], [side, 0], [side, side], [0, side]], dtype=np.float32)
+    turn = cv2.getPerspectiveTransform(plane, corners.astype(np.float32))
+    across = np.arange(0.5, side - 0.49, 1.0 / _SAMPLED)
+    points = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
+    undistorted = cv2.perspectiveTransform(points[:, None], turn)[:, 0].astype(np.float64)
+    seen = _at(image, distort_pixels(camera, undistorted))
+    sharp = np.pad(white, 1, constant_values=1.0).repeat(_DRAWN, axis=0).repeat(_DRAWN, axis=1)
+    drawn = cv2.GaussianBlur(sharp, (0, 0), _BLUR / scale * _DRAWN)
+    down, right = np.gradient(drawn, 1.0 / _DRAWN)
+    u, v = points.T / side
+    weights = np.column_stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v])
+    shifts: Array = np.zeros((4, 2))  # of the corners, from edges to modules, [modules]
+    for _ in range(6):
+        where = (points - weights @ shifts + 1.0) * _DRAWN - 0.5
+        values, by_x, by_y = (_at(picture, where)[:, None] for picture in (drawn, right, down))
+        design = np.hstack([np.ones_like(values), values, -weights * by_x, -weights * by_y])
+        fit = np.linalg.lstsq(design, seen, rcond=None)[0]
+        if not fit[1] > 0.0:
+            return False
+        shifts = shifts + fit[2:].reshape(2, 4).T / fit[1]
+    ends = np.array([shifts[[k, (k + 1) % 4], 1 - k % 2] for k in range(4)])
+    return bool(np.all(np.abs(ends) * scale < AGREE))
+
+
+def _at(picture: cv2.typing.MatLike, points: Array) -> Array:
+    """Brightness at points, shape (k, 2), [px]."""
+    column, row = (np.ascontiguousarray(points[:, k], dtype=np.float32) for k in (0, 1))
+    values = cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64).ravel()
