@@ -138,6 +138,11 @@ class RigFit:
         return self.residuals[:, : self.residuals.shape[1] - len(self.sensors)]
 
     @property
+    def squares(self) -> float:
+        """Sum of weighted squares of the residuals of cables and sensors, in deviations."""
+        return float(np.sum(self.weights * (self.residuals / self.deviations) ** 2))
+
+    @property
     def sensor_rms(self) -> Array:
         """RMS of each sensor's residuals where measured, shape (k − m,), [rad]."""
         m = self.cables.shape[1]

@@ -182,11 +182,6 @@ def _numbers(measured: RigMeasurements, fit: RigFit) -> int:
     return int(np.isfinite(fit.deviations).sum() - measured.unmeasured.sum())
 
 
-def _residual_squares(fit: RigFit) -> float:
-    """Sum of weighted squares of the residuals of cables and sensors, in deviations."""
-    return float(np.sum(fit.weights * (fit.residuals / fit.deviations) ** 2))
-
-
 _MEDIAN_DISTANCE, _MEDIAN_DEVIATION = 1.54, 0.87
 """Median of a distance along three axes, in deviations; its own deviation with n samples, by √n."""
 
@@ -204,7 +199,7 @@ def pose_scales(measured: RigMeasurements, fit: RigFit, observability: Observabi
         observability: These directions.
     """
     numbers, unknowns = _numbers(measured, fit), observability.known.shape[1]
-    usual = max(numbers - unknowns, _residual_squares(fit), 1.0) / max(numbers, 1)
+    usual = max(numbers - unknowns, fit.squares, 1.0) / max(numbers, 1)
     errors = measured.pose_errors(fit.positions, fit.rotations)
     errors[:, :3] = measured.measured_points(fit.positions, fit.rotations) - measured.positions
     rotated = measured.has_position & measured.has_rotation
@@ -335,16 +330,23 @@ def _tension_squares(
 ) -> Array:
     """As in `RigUncertainty`; ``ratio`` of the variance of residuals to the stated one."""
     numbers, known = _numbers(measured, fit), observability.known
+    if not numbers:  # the poses follow all errors
+        return read_only(np.zeros(len(fit.tension_squares)))
     at = (parameters.geometry(fit.values), measured, fit.positions, fit.rotations)
     by_statics = tension_variance(parameters.rig, *at) * fit.tension_squares
-    # They are those of the reduced compliance.
     whole = known.T @ fit.information @ known + np.eye(known.shape[1])
-    scores = known.T @ tension_scores(parameters, by_statics)
-    moved = parameters.deviations * (known @ np.linalg.solve(whole, scores))
-    reduced = [moved[k] for k, n in enumerate(parameters.names) if n.startswith("stiffness")]
-    by_statics /= max(1.0 - max(reduced, default=0.0), LEAST_SHARE)
+    is_stiffness = np.array([name.startswith("stiffness") for name in parameters.names])
+
+    def reduced(squares: Array) -> float:
+        """Largest change of a stiffness by errors with these squares, logarithmic."""
+        scores = known.T @ tension_scores(parameters, squares)
+        moved = parameters.deviations * (known @ np.linalg.solve(whole, scores))
+        return float(moved[is_stiffness].max(initial=0.0))
+
+    by_statics /= max(1.0 - reduced(by_statics), LEAST_SHARE)  # they are of the reduced compliance
     share = min(max(float(by_statics.sum()) / numbers, ratio - 1.0), ratio)
-    return read_only(share * numbers * fit.tension_squares / fit.tension_squares.sum())
+    squares = share * numbers * fit.tension_squares / fit.tension_squares.sum()
+    return read_only(squares / max(reduced(squares) / np.log(1.0 / LEAST_SHARE), 1.0))
 
 
 def uncertainty_of_rig(
@@ -367,9 +369,8 @@ def uncertainty_of_rig(
     scores = fit.scores @ known
     whole = informations.sum(axis=0) + np.eye(known.shape[1])
     of_poses = float(np.sum(huber_weight(fit.pose_misfits, POSE_BEND) * fit.pose_misfits**2))
-    numbers = _numbers(measured, fit)
-    freedom = numbers - known.shape[1]
-    found = (_residual_squares(fit) + of_poses) / max(freedom, 1)
+    freedom = max(_numbers(measured, fit) - known.shape[1], 1)
+    found = (fit.squares + of_poses) / freedom
     scatter = max(1.0, found)
     count = len(measured)
     without = np.linalg.solve(whole - informations, scores[..., None])[..., 0]
@@ -426,12 +427,11 @@ def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation
     n = len(measured)
     posed = bool(measured.has_position.all())
     before, after = np.empty(n), np.empty(n)
-    zero = np.zeros(len(parameters))
     for fold in range(FOLDS):
         out = np.arange(n) % FOLDS == fold
         rest, left_out = measured.part(~out), measured.part(out)
         fit, _ = identified(parameters, rest, length_deviation)
-        for errors, values in ((before, zero), (after, fit.values)):
+        for errors, values in ((before, 0.0 * fit.values), (after, fit.values)):
             errors[out] = _errors(parameters, values, left_out, posed)
     return HeldOut(before, after, posed)
 

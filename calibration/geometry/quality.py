@@ -175,7 +175,9 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
     free_scores = result.observability.known.T @ tension_scores(parameters, by_logarithm)
     biased = np.linalg.solve(own, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
-    return change, covariance + np.outer(biased, biased)
+    # Errors of tensions only make cables seem stiffer.
+    explained = np.where(change < 0.0, biased, 0.0)
+    return change, covariance + np.outer(explained, explained)
 
 
 # The verdict.
@@ -192,9 +194,9 @@ _COMMON = (
 )
 """Next step where errors common to all measured poses are the larger part."""
 _TENSIONS = (
-    "measure tensions with smaller errors (friction, gears), or with the platform rotated, since"
-    " their errors make the cables seem too stiff; or enter a measured stiffness_n in the rig file"
-    " and pass --known stiffness, in Python leave stiffness out of deviations="
+    "measure tensions with smaller errors (friction, gears, gains that differ), or with the platform"
+    " rotated, since their errors make the cables seem too stiff; or enter a measured stiffness_n in"
+    " the rig file and pass --known stiffness, in Python leave stiffness out of deviations="
 )
 """Next step where errors of measured tensions are the larger part."""
 

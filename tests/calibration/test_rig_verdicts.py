@@ -123,12 +123,37 @@ def test_errors_of_tensions_do_not_contradict_a_known_stiffness(
 def test_errors_of_tensions_do_not_hide_a_wrong_known_stiffness(
     level: list[Sample],
 ) -> None:
-    for factor in (0.4, 2.5):
-        rig, data = level[0]
+    """They only make cables seem stiffer, so they do not excuse a file that is too stiff."""
+    for sample, factor, size in ((0, 0.4, 0.3), (0, 2.5, 0.3), (1, 2.5, 1.0)):
+        rig, data = level[sample]
         drawn = with_nominal_stiffness(rig, factor * 6000.0)
-        found = calibrated(drawn, with_tension_errors(data, 0.3), KNOWN_STIFFNESS)
+        found = calibrated(drawn, with_tension_errors(data, size), KNOWN_STIFFNESS)
         reasons = judge_rig(found, 1e-3, 0.0).verdict.reasons
         assert any("the data give a cable stiffness of" in reason for reason in reasons)
+
+
+def test_a_gross_mistake_does_not_explain_itself_by_errors_of_tensions(
+    level: list[Sample],
+) -> None:
+    """Squares that errors of tensions need to halve the compliance are the most assumed."""
+    rig, data = level[0]
+    data = replace(data, positions=data.positions * np.array([1.0, 1.0, 0.5]))
+    found = calibrated(rig, data)
+    biased = found.uncertainty.by_tensions[found.parameters.slices()["stiffness"]]
+    assert np.all(np.abs(biased) <= np.log(2.0))
+    assert not judge_rig(found, 1e-3, 0.0).verdict.good
+
+
+def test_six_cables_without_poses_are_not_good_enough() -> None:
+    """The poses follow all errors of the lengths: nothing is left to judge tensions by."""
+    document = load_rig(CONFIGS / "gachon_8_6.yaml").as_dict()
+    document["cables"]["min_tension_n"] = 0.1
+    for key in ("outlets_mm", "anchors_mm", "winches"):
+        document[key] = [document[key][k] for k in (0, 1, 2, 3, 4, 7)]
+    rig = Rig.from_dict(document)
+    found = calibrated(rig, only(measured(built_rig(rig, 0), 20, 1)).without_poses())
+    assert not found.uncertainty.by_tensions.any()
+    assert not judge_rig(found, 1e-3, 0.0).verdict.good
 
 
 def test_the_forces_on_the_platform_show_errors_of_tensions(
