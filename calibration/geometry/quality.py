@@ -194,9 +194,10 @@ _COMMON = (
 )
 """Next step where errors common to all measured poses are the larger part."""
 _TENSIONS = (
-    "measure tensions with smaller errors (friction, gears, gains that differ), or with the platform"
-    " rotated, since their errors make the cables seem too stiff; or enter a measured stiffness_n in"
-    " the rig file and pass --known stiffness, in Python leave stiffness out of deviations="
+    "measure tensions with smaller errors (friction, gears, gains that differ), or with the"
+    " platform rotated, since their errors make the cables seem too stiff; or enter a measured"
+    " stiffness_n in the rig file and pass --known stiffness, in Python leave stiffness out of"
+    " deviations="
 )
 """Next step where errors of measured tensions are the larger part."""
 
