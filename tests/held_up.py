@@ -20,8 +20,12 @@ REPEATS = 9
 
 
 def reports_late_cycles(failure: str) -> bool:
-    """Whether the text of a failure holds the message of a run that ended for late cycles."""
-    return re.search(r"a cycle began \d+\.\d cycles late", failure) is not None
+    """Whether the text of a failure holds the message of a run that ended for late cycles.
+
+    So does a drive that stops since SYNC is late, before the next cycle begins.
+    """
+    late = r"a cycle began \d+\.\d cycles late|SYNC missed or out of time \(error 8700h\)"
+    return re.search(late, failure) is not None
 
 
 class HoldUp:

@@ -1604,7 +1604,8 @@ def test_nothing_runs_that_was_not_seen_to_pass(served: Served) -> None:
         assert not command(page, "load_plan", file="secret.txt")["ok"]
         assert command(page, "load_plan", file="short.json")["ok"]
         shown = json.loads(served.get("/api/preview")[1])
-        assert state(page)["preview"] == f"short.json {shown['hash']}"
+        # The next state may have been made before.
+        assert f"short.json {shown['hash']}" in (state(page)["preview"] for _ in range(3))
         assert shown["passed"]
         assert len(shown["moments"]) == len(shown["curves"]["time_s"])
         assert "a different plan" in command(page, "run", plan="of another tab")["what"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
+from drivers.cia402.error_codes import emergency_text
 from executor.control.sync_master import late_fault
 from executor.safety.fault_messages import late
 from tests.held_up import LIMIT_S, HoldUp, reports_late_cycles
@@ -20,4 +21,7 @@ def test_a_failure_with_the_message_of_a_run_that_ended_for_late_cycles_is_a_hol
     ended = f"FAILED after 1.4 s: {late(2.0, too_late=True).text}; quick stop of all drives"
     assert reports_late_cycles(ended)
     assert reports_late_cycles(str(late_fault(3.0)))
+    assert reports_late_cycles(
+        f"cable 1 (drive 1): {emergency_text(0x8700)}; quick stop of all drives"
+    )
     assert not reports_late_cycles("assert 'a cycle began' in 'drive 3 (cable 3) does not answer'")
