@@ -21,7 +21,5 @@ def test_a_failure_with_the_message_of_a_run_that_ended_for_late_cycles_is_a_hol
     ended = f"FAILED after 1.4 s: {late(2.0, too_late=True).text}; quick stop of all drives"
     assert reports_late_cycles(ended)
     assert reports_late_cycles(str(late_fault(3.0)))
-    assert reports_late_cycles(
-        f"drive 1: {emergency_text(0x8700)}; quick stop of all drives"
-    )
+    assert reports_late_cycles(f"drive 1: {emergency_text(0x8700)}; quick stop of all drives")
     assert not reports_late_cycles("assert 'a cycle began' in 'drive 3 (cable 3) does not answer'")
