@@ -311,18 +311,19 @@ def optimal_route(
     def begin(at: Scene, by: Weights) -> CompiledSearch:
         return CompiledSearch(rig, at, by, kinematic, settings.seed)
 
-    _load(begin(scene, weights))
-    limited = None
+    to_do: CompiledSearch | LimitedSearch[CompiledSearch]
     if settings.longest < math.inf:
-        limited = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
-    search = begin(scene, weights) if limited is None else limited.first
+        to_do = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
+        search = to_do.first
+    else:
+        to_do = search = begin(scene, weights)
+    _load(search)
     prepared = clock()
-    rounds = _improve(limited or search, search, settings, prepared, progress, clock)
-    path = search.path if limited is None else limited.path
+    rounds = _improve(to_do, search, settings, prepared, progress, clock)
+    path = to_do.path
     if path is None:
         raise no_path(rig, scene, search.problem, search.state, settings)
-    checks = search.checks if limited is None else limited.checks
-    return Route.from_rounds(path, search.first, rounds, checks, clock() - prepared)
+    return Route.from_rounds(path, search.first, rounds, to_do.checks, clock() - prepared)
 
 
 class CompiledSearch:

@@ -251,13 +251,13 @@ def rotating_route(
     def begin(at: Scene, by: Weights) -> RotatingSearch:
         return RotatingSearch(rotating_problem(rig, at, by, kinematic), start, goal, settings.seed)
 
-    limited = None
+    to_do: RotatingSearch | LimitedSearch[RotatingSearch]
     if settings.longest < math.inf:
-        limited = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
-    search = (
-        RotatingSearch(problem, start, goal, settings.seed) if limited is None else limited.first
-    )
-    began, spent, rounds, to_do = clock(), 0.0, 0, search if limited is None else limited
+        to_do = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
+        search = to_do.first
+    else:
+        to_do = search = RotatingSearch(problem, start, goal, settings.seed)
+    began, spent, rounds = clock(), 0.0, 0
     while not _is_over(settings, search, rounds, spent):
         to_do.advance()
         rounds, spent = rounds + 1, clock() - began
