@@ -349,8 +349,10 @@ class PlatformEstimator:
             worst = displaced_tag(self._camera, views, pose, limit, self._settings.contradiction)
             if worst is None or len(views) == 1:
                 views, bundle = fitted
-                spread = scatter_without_one(bundle, self._shared.expected_cost(bundle, views))
-                return views, replace(bundle, displaced=displaced, without_one=spread)
+                if bundle.freedom == 2:  # four edges in all
+                    expected = self._shared.expected_cost(bundle, views)
+                    bundle = replace(bundle, without_one=scatter_without_one(bundle, expected))
+                return views, replace(bundle, displaced=displaced)
             views = [view for view in views if view is not worst]
             displaced += (worst.tag.id,)
         return None

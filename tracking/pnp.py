@@ -354,10 +354,10 @@ def scatter_without_one(bundle: BundlePose, expected: float) -> Array:
     all of it, however little of it the pose leaves over. Otherwise the result is 0.
 
     Args:
-        bundle: The pose.
+        bundle: A pose from four edges.
         expected: The expected cost, `freedom` or more.
     """
-    if bundle.freedom != 2 or bundle.cost <= ONE_WRONG * expected:
+    if bundle.cost <= ONE_WRONG * expected:
         return np.zeros((6, 6))
     squares, pose = bundle.squares, bundle.camera_from_body
     edges = squares.edges.reshape(-1)

@@ -15,7 +15,7 @@ from model.pose import Array
 from model.rig import Camera
 from tracking.camera_model import Image, distort_pixels, linear
 from tracking.detection.detector import TagDetector
-from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror
+from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror, brightness_at
 from tracking.edges.refine import RefinedTag
 
 #: Families that are tried to identify a wrong one. The largest ArUco dictionary of a size includes
@@ -201,8 +201,7 @@ def printed_share(image: Image, markers: Array, squares: Array, modules: int) ->
         on_edges[:, :, None] - middles
     )
     back = np.array([cv2.getPerspectiveTransform(UNIT_SQUARE, plane) for plane in planes])
-    x, y = np.moveaxis(_transformed(back, lines.reshape(len(flat), -1, 2)), 2, 0).astype(np.float32)
-    read = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    read = brightness_at(image, _transformed(back, lines.reshape(len(flat), -1, 2)))
     brightness = read.reshape(lines.shape[:4]).mean(axis=3)
     black, white = brightness.min(axis=2, keepdims=True), brightness.max(axis=2, keepdims=True)
     ink = (white - brightness) / np.maximum(white - black, 1.0)
@@ -334,11 +333,10 @@ def _beside_edges(
         starts[:, None, None]
         + share[:, None, None] * along[:, None, None]
         + away[:, None, :, None] * outward[:, None, None]
-    ).astype(np.float32)
-    column = np.ascontiguousarray(points[..., 0]).reshape(len(points), -1)
-    row = np.ascontiguousarray(points[..., 1]).reshape(len(points), -1)
-    read = cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    lines = read.reshape(len(points), _POSITIONS, 4, _DISTANCES).mean(axis=3)
+    )
+    lines = (
+        brightness_at(image, points).reshape(len(points), _POSITIONS, 4, _DISTANCES).mean(axis=3)
+    )
     ink, dark, bright, paper = np.median(lines, axis=1).T  # robust against cables across an edge
     overshoot = np.median((bright - paper + ink - dark) / np.maximum(paper - ink, 1.0))
     return float(overshoot), float(np.mean(paper >= _CLIPPED))

@@ -227,15 +227,25 @@ def module_brightness(image: Image, square: Array, modules: int, around: int = 0
     Returns:
         Shape (modules + 2 around, modules + 2 around).
     """
+    middle = np.arange(-around, modules + around) + 0.5
+    grid = np.stack(np.meshgrid(middle, middle), axis=-1)
+    return brightness_at(image, _in_square(square, modules, grid))
+
+
+def _in_square(square: Array, modules: int, points: Array) -> Array:
+    """Points of a square, shape (..., 2), [modules] from its first corner, in pixels."""
     plane = np.array([[0, 0], [modules, 0], [modules, modules], [0, modules]], dtype=np.float32)
     turn = cv2.getPerspectiveTransform(plane, square.astype(np.float32))
-    middle = np.arange(-around, modules + around) + 0.5
-    grid = np.stack(np.meshgrid(middle, middle), axis=-1).reshape(-1, 1, 2)
-    side = modules + 2 * around
-    points = cv2.perspectiveTransform(grid, turn).astype(np.float32).reshape(side, side, 2)
-    column, row = np.ascontiguousarray(points[..., 0]), np.ascontiguousarray(points[..., 1])
-    values = cv2.remap(image, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float64)
+    found = cv2.perspectiveTransform(points.reshape(-1, 1, 2), turn)
+    return np.asarray(found, dtype=np.float64).reshape(points.shape)
+
+
+def brightness_at(picture: cv2.typing.MatLike, points: Array) -> Array:
+    """Brightness between pixels, bilinear; points shape (..., 2), [px], result shape (...)."""
+    maps = points.reshape(len(points), -1, 2).astype(np.float32)
+    column, row = (np.ascontiguousarray(maps[..., k]) for k in (0, 1))
+    values = cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(values, dtype=np.float64).reshape(points.shape[:-1])
 
 
 def _has_border(values: Array, inner: Array) -> bool:
@@ -310,12 +320,9 @@ def agrees_with_modules(
     white = official_modules(family, number).astype(np.float32)
     side = len(white)
     scale = math.sqrt(abs(cv2.contourArea(corners.astype(np.float32)))) / side
-    plane = np.array([[0, 0], [side, 0], [side, side], [0, side]], dtype=np.float32)
-    turn = cv2.getPerspectiveTransform(plane, corners.astype(np.float32))
     across = np.arange(0.5, side - 0.49, 1.0 / _SAMPLED)
     points = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
-    undistorted = cv2.perspectiveTransform(points[:, None], turn)[:, 0].astype(np.float64)
-    seen = _at(image, distort_pixels(camera, undistorted))
+    seen = brightness_at(image, distort_pixels(camera, _in_square(corners, side, points)))
     sharp = np.pad(white, 1, constant_values=1.0).repeat(_DRAWN, axis=0).repeat(_DRAWN, axis=1)
     drawn = cv2.GaussianBlur(sharp, (0, 0), _BLUR / scale * _DRAWN)
     down, right = np.gradient(drawn, 1.0 / _DRAWN)
@@ -324,7 +331,8 @@ def agrees_with_modules(
     shifts: Array = np.zeros((4, 2))  # of the corners, from edges to modules, [modules]
     for _ in range(6):
         where = (points - weights @ shifts + 1.0) * _DRAWN - 0.5
-        values, by_x, by_y = (_at(picture, where)[:, None] for picture in (drawn, right, down))
+        pictures = (drawn, right, down)
+        values, by_x, by_y = (brightness_at(picture, where)[:, None] for picture in pictures)
         design = np.hstack([np.ones_like(values), values, -weights * by_x, -weights * by_y])
         fit = np.linalg.lstsq(design, seen, rcond=None)[0]
         if not fit[1] > 0.0:
@@ -332,10 +340,3 @@ def agrees_with_modules(
         shifts = shifts + fit[2:].reshape(2, 4).T / fit[1]
     ends = np.array([shifts[[k, (k + 1) % 4], 1 - k % 2] for k in range(4)])
     return bool(np.all(np.abs(ends) * scale < AGREE))
-
-
-def _at(picture: cv2.typing.MatLike, points: Array) -> Array:
-    """Brightness at points, shape (k, 2), [px]."""
-    column, row = (np.ascontiguousarray(points[:, k], dtype=np.float32) for k in (0, 1))
-    values = cv2.remap(picture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float64).ravel()
