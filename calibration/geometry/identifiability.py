@@ -306,42 +306,32 @@ def _bounds(slopes: Array, changes: Array) -> Array:
     return np.asarray(np.sqrt(slopes.shape[1]) * np.array(bounds))
 
 
-def tension_scores(parameters: Parameters, squares: Array) -> Array:
-    """Half the gradient of squares by errors of measured tensions, shape (p,).
-
-    Args:
-        parameters: The unknowns; in their deviations.
-        squares: Growth of each cable's squares by these errors, shape (m,).
-    """
-    scores, slices = np.zeros(len(parameters)), parameters.slices()
-    if "stiffness" in slices:
-        scores[slices["stiffness"]] = squares.sum()
-    if "cable_stiffness" in slices:
-        scores[slices["cable_stiffness"]] = squares
-    return np.asarray(scores * parameters.deviations)
-
-
 def _tension_squares(
     parameters: Parameters,
     measured: RigMeasurements,
     fit: RigFit,
-    observability: Observability,
+    moved_by: Callable[[Array], Array],
     ratio: float,
 ) -> Array:
-    """As in `RigUncertainty`; ``ratio`` of the variance of residuals to the stated one."""
-    numbers, known = _numbers(measured, fit), observability.known
+    """As in `RigUncertainty`.
+
+    Args:
+        parameters: The unknowns.
+        measured: Stationary samples.
+        fit: Their fit.
+        moved_by: Changes of the unknowns, shape (p,), by such squares.
+        ratio: Of the variance of residuals to the stated one.
+    """
+    numbers = _numbers(measured, fit)
     if not numbers:  # the poses follow all errors
         return read_only(np.zeros(len(fit.tension_squares)))
     at = (parameters.geometry(fit.values), measured, fit.positions, fit.rotations)
     by_statics = tension_variance(parameters.rig, *at) * fit.tension_squares
-    whole = known.T @ fit.information @ known + np.eye(known.shape[1])
     is_stiffness = np.array([name.startswith("stiffness") for name in parameters.names])
 
     def reduced(squares: Array) -> float:
-        """Largest change of a stiffness by errors with these squares, logarithmic."""
-        scores = known.T @ tension_scores(parameters, squares)
-        moved = parameters.deviations * (known @ np.linalg.solve(whole, scores))
-        return float(moved[is_stiffness].max(initial=0.0))
+        """Largest change of a stiffness, logarithmic."""
+        return float(moved_by(squares)[is_stiffness].max(initial=0.0))
 
     by_statics /= max(1.0 - reduced(by_statics), LEAST_SHARE)  # they are of the reduced compliance
     share = min(max(float(by_statics.sum()) / numbers, ratio - 1.0), ratio)
@@ -385,9 +375,13 @@ def uncertainty_of_rig(
     by_scatter, by_jackknife = (read_only(inner * np.outer(spread, spread)) for inner in of_all)
     pulled = known @ np.linalg.solve(whole, known.T @ fit.common_scores)
     common = read_only(-spread[:, None] * pulled)
-    squares = _tension_squares(parameters, measured, fit, observability, found)
-    biased = np.linalg.solve(whole, known.T @ tension_scores(parameters, squares))
-    by_tensions = read_only(-ALL_OR_NONE * (spread * (known @ biased))[:, None])
+
+    def moved_by(squares: Array) -> Array:
+        scores = known.T @ parameters.tension_scores(squares)
+        return np.asarray(spread * (known @ np.linalg.solve(whole, scores)))
+
+    squares = _tension_squares(parameters, measured, fit, moved_by, found)
+    by_tensions = read_only(-ALL_OR_NONE * moved_by(squares)[:, None])
     quantile = student_factor(count - 1)
     return RigUncertainty(by_scatter, by_jackknife, common, by_tensions, squares, scatter, quantile)
 
@@ -431,7 +425,7 @@ def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation
         out = np.arange(n) % FOLDS == fold
         rest, left_out = measured.part(~out), measured.part(out)
         fit, _ = identified(parameters, rest, length_deviation)
-        for errors, values in ((before, 0.0 * fit.values), (after, fit.values)):
+        for errors, values in ((before, np.zeros(len(parameters))), (after, fit.values)):
             errors[out] = _errors(parameters, values, left_out, posed)
     return HeldOut(before, after, posed)
 

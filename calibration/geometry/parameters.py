@@ -150,6 +150,19 @@ class Parameters:
             imu_mounting=of("imu_mounting", 3),
         )
 
+    def tension_scores(self, squares: Array) -> Array:
+        """Half the gradient of squares by errors of measured tensions, shape (p,), in `deviations`.
+
+        Args:
+            squares: Growth of each cable's squares by these errors, shape (m,).
+        """
+        scores, slices = np.zeros(len(self)), self.slices()
+        if "stiffness" in slices:
+            scores[slices["stiffness"]] = squares.sum()
+        if "cable_stiffness" in slices:
+            scores[slices["cable_stiffness"]] = squares
+        return np.asarray(scores * self.deviations)
+
 
 def _names(group: str, m: int) -> list[str]:
     if group in _OF_ALL_CABLES:

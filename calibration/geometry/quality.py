@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from calibration.geometry.calibrate import RigCalibration, workspace_poses
-from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE, tension_scores
+from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE
 from calibration.geometry.model import RigModel
 from calibration.results import CalibrationVerdict, Issue
 from calibration.statistics import CONFIDENCE
@@ -173,7 +173,7 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     left = max(1.0 + float(pull @ change) / squares.sum(), 0.0) if squares.any() else 0.0
     by_share = left * squares / np.maximum(nominal + groups @ change, LEAST_SHARE * nominal)
     by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
-    free_scores = result.observability.known.T @ tension_scores(parameters, by_logarithm)
+    free_scores = result.observability.known.T @ parameters.tension_scores(by_logarithm)
     biased = np.linalg.solve(own, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
     # Errors of tensions only make cables seem stiffer.
     explained = np.where(change < 0.0, biased, 0.0)
