@@ -162,13 +162,12 @@ class VideoFile(FrameSource):
                 if not good:
                     break
                 image = _grey(np.asarray(picture))
+                stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
                 if number == 0:
                     refuse_wrong_size(image, self._camera, str(self._path))
-                    begin = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # not always 0
-                    begin = begin if np.isfinite(begin) else 0.0
-                shown = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - begin  # the rate may vary
-                is_later = np.isfinite(shown) and shown > seconds
-                is_later = is_later and self._has_times
+                    begin = stated if np.isfinite(stated) else 0.0  # not always 0
+                shown = stated - begin
+                is_later = self._has_times and np.isfinite(shown) and shown > seconds
                 seconds = shown if is_later else seconds + 1.0 / self.rate
                 yield Frame(seconds, image, f"image {number}", number)
                 number += 1
