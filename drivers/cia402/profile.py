@@ -7,7 +7,7 @@ elsewhere; ``drives.profile`` of the rig file names it.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 from drivers.can_load import heartbeat_cycles
@@ -35,6 +35,7 @@ STANDARD_PDOS = 4
 """RPDOs and TPDOs of which a drive may have any subset."""
 
 
+@cache
 def profile_names() -> tuple[str, ...]:
     """The profiles shipped with cdpr."""
     return tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))
