@@ -177,7 +177,8 @@ class PowerLoss:
 
     Attributes:
         miscounted: Offset of each drive's counts, shape (m,), [counts].
-        slack: Length that each drum has paid out, shape (m,), [m].
+        slack: Length that each drum has paid out, shape (m,), [m]; on a stand beyond the stretch
+            of its cable, which is slack by this length then.
         on_a_stand: The platform rests on a support; otherwise it hangs on the taut cables.
     """
 
@@ -207,11 +208,13 @@ class PowerLoss:
         Raises:
             Fault: The platform has no equilibrium there.
         """
+        paid_out = self.slack
         if self.on_a_stand:
+            paid_out = paid_out + plant.stretch
             plant.support()
         plant.miscounted = self.miscounted
-        for winch, motor, more, slack in zip(
-            rig.winches, motors, self.miscounted, self.slack, strict=True
+        for winch, motor, more, length in zip(
+            rig.winches, motors, self.miscounted, paid_out, strict=True
         ):
-            motor.position += float(more) + round(slack * winch.counts_per_metre)
+            motor.position += float(more) + round(length * winch.counts_per_metre)
             motor.demand = motor.position

@@ -235,6 +235,11 @@ class Plant:
         """
         self._is_supported = True
 
+    @property
+    def stretch(self) -> Array:
+        """By how much each whole cable is longer than unstrained, shape (m,), [m]; 0 if slack."""
+        return self.tensions * self._suspension.unstrained / self.winch_map.stiffness
+
     def settle_counts(self, counts: Array) -> None:
         """`settle` at drive positions, shape (m,), [counts]."""
         for _ in self.settling_counts(counts):

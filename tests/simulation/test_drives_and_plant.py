@@ -18,11 +18,13 @@ from drivers.factory import make_drive_group
 from model.errors import Refused
 from model.kinematics import cable_lengths
 from model.pose import Pose
-from model.rig import Rig, rig_from_document
+from model.rig import Rig, load_rig, rig_from_document
 from model.statics.gravity import working_tensions
 from simulation.drives.behaviour import behaviour_named
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.drives.odrive import SimulatedOdriveRig
+from simulation.ground_truth import PowerLoss
+from simulation.plant import Plant
 from simulation.rig import RehearsalStatus
 from tests.drivers.odrive_bench import odrive_bench, odrive_rig
 
@@ -53,6 +55,23 @@ def enabled(robot: Rig, group: DriveGroup, rehearsal: SimulatedCia402Rig) -> lis
         group.receive(0.0)
     assert group.state is GroupState.ENABLED
     return start
+
+
+
+@pytest.mark.parametrize("file", ["gachon_8_6", "hall_10_6", "open_frame_8_6"])
+def test_a_cable_that_is_slack_on_a_stand_is_so_however_elastic_it_is(
+    file: str, channel: BusSettings
+) -> None:
+    robot = load_rig(f"configs/{file}.yaml")
+    with open_bus(channel) as bus:
+        rehearsal = SimulatedCia402Rig(robot, bus, robot.home)
+        plant, motors = rehearsal.plant, [drive.motor for drive in rehearsal.drives]
+        taut = Plant(robot, robot.home).tensions
+        PowerLoss.drawn(robot, 1, 0.005, on_a_stand=True).apply_to(robot, plant, motors)
+        plant.settle_counts(np.array([motor.position for motor in motors]))
+    assert (taut > 0.0).all()
+    assert (plant.tensions == 0.0).all()
+    assert plant.pose.distance_to(robot.home) == pytest.approx(0.0, abs=1e-9)
 
 
 def circle(robot: Rig, cycles: int) -> Iterator[Pose]:
