@@ -108,9 +108,11 @@ def evaluate(
         outcome: Of the motion.
         seen: Camera records.
         course: Of the run, with its end.
-        recorder: Of the run.
+        recorder: Of the run; its cycles are written, or never will be.
     """
     folder, take_file = recorder.folder, recorder.writer.take_file
+    lost = _lost_cycles(course, recorder.writer.unwritten)
+    course = replace(course, troubles=(*course.troubles, *lost))
     take_file(partial(_written, [(COURSE, partial(folder.write_end_of_course, course))]))
     cycles = outcome.log.table()
     poses = _pose_table(seen.together, cycles)
@@ -121,6 +123,12 @@ def evaluate(
     context = RunContext(prepared.plan.plan, prepared.rig, course, tuple(outcome.log.events))
     summary = summarize(context, cycles, poses, clearance)
     return EvaluatedRun(context, cycles, poses, alone, clearance, summary)
+
+
+def _lost_cycles(course: RunCourse, lost: int) -> list[str]:
+    """Cycles that could not be written, in a sentence, if any."""
+    text = f"Of {course.cycles} cycles the last {lost} are not on record"
+    return [text] if lost > 0 and text not in course.troubles else []
 
 
 def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
@@ -138,9 +146,7 @@ def evaluate_folder(folder: RunFolder) -> EvaluatedRun:
         course = _ended_by_events(course, cycles, events)
     if len(cycles) == course.cycles - 1 and not folder.has(CYCLES):
         cycles = _with_last_row(folder, cycles)
-    troubles = list(course.troubles)
-    if (lost := course.cycles - len(cycles)) > 0:
-        troubles.append(f"Of {course.cycles} cycles the last {lost} are not on record")
+    troubles = [*course.troubles, *_lost_cycles(course, course.cycles - len(cycles))]
     if folder.has(CLEARANCE):
         clearance = folder.clearance()
     else:

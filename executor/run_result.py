@@ -57,11 +57,12 @@ class RunResult:
     _given: Path = field(init=False)
 
     def __post_init__(self) -> None:
-        """Makes the paths independent of the current folder."""
+        """Makes the paths independent of the current folder, unless that was removed."""
         object.__setattr__(self, "_given", self.folder)
-        object.__setattr__(self, "folder", self.folder.absolute())
-        if self.report is not None:
-            object.__setattr__(self, "report", self.report.absolute())
+        with suppress(OSError):
+            object.__setattr__(self, "folder", self.folder.absolute())
+            if self.report is not None:
+                object.__setattr__(self, "report", self.report.absolute())
 
     @property
     def shown_folder(self) -> Path:
@@ -128,6 +129,8 @@ class RunResult:
         cycles = self.folder / CYCLES
         if cycles.is_file() and cycles.stat().st_size > TABLE_LIMIT:
             again += " on a computer with more memory, which can read the record"
+        if POSES in self.missing and not (self.folder / POSES).is_file():
+            again += f"; {POSES} cannot be made again, so that the new verdict is FAILED"
         then = again if self.folder.is_dir() else removed
         lines.append(f"  next: the verdict and the exit code are valid; {then}")
         return "\n".join(lines)

@@ -404,12 +404,12 @@ def _conclude(job: _Job, moved: _MotionData) -> RunResult:
     outcome, supervisor = moved.outcome, job.commands.supervisor
     assert outcome is not None
     with moved.listener.waiting("evaluating the run"):
+        moved.close()  # what is not on record fails the run, as during the motion
         course = _course(moved, outcome)
         evaluated, summary = _evaluated(job, moved, outcome, course)
     result = RunResult(job.folder.path, summary)
     supervisor.on_verdict(result)
     with moved.listener.waiting("writing the run folder and report"):
-        moved.close()
         events, left_out = outcome.log.events, supervisor.leaves_files_out
         missing = write_end(job.folder, course, evaluated, events, left_out)
     if moved.callbacks.error not in " ".join((course.cause, *course.troubles)):

@@ -329,6 +329,9 @@ def _discard_output() -> None:
 def _from_os_error(error: OSError) -> CdprError:
     """An `OSError` that no verb handled, as bad input (a path) or a fault (the output)."""
     why = error.strerror or str(error)
+    if isinstance(error, FileNotFoundError) and not _current_folder_exists():
+        hint = "change to a folder that exists, then repeat the command"
+        return BadInput("the current folder was removed", next_step=hint)
     if error.filename is not None:
         hint = "check the path, its permissions and the free space"
         return BadInput(
@@ -336,6 +339,13 @@ def _from_os_error(error: OSError) -> CdprError:
         )
     hint = "check the output's destination and its free space"
     return Fault("the command could not write all its output", why=why, next_step=hint)
+
+
+def _current_folder_exists() -> bool:
+    try:
+        return Path.cwd().is_dir()
+    except OSError:
+        return False
 
 
 def _refuse_hidden_package(error: Exception) -> None:

@@ -272,6 +272,11 @@ class RecordWriter:
         else:
             self._waiting.put(write)
 
+    @property
+    def unwritten(self) -> int:
+        """Number of the last cycles that are not written yet, or never will be."""
+        return len(self._log) - self._written.end
+
     def close(self) -> None:
         """Writes the rest, and waits for it; never raises."""
         try:

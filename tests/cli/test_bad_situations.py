@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -13,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
@@ -23,6 +25,8 @@ from drivers.can_errors import ControllerState
 from drivers.cia402 import sdo
 from executor.cameras import process as camera_process
 from executor.cameras.process import CameraProcess
+from executor.recording.run_folder import RunFolder
+from model.errors import Fault
 from model.plan import save_plan
 from model.rig import load_rig
 from model.scene import load_scene
@@ -495,3 +499,61 @@ def test_a_package_that_the_user_hides_is_not_called_a_defect(tmp_path: Path, fi
     package = file.partition("/")[0].removesuffix(".py")
     one_message(answer, 2, f"{hiding}: ", f"hides the package `{package}` of cdpr", "PYTHONPATH")
     assert "defect" not in answer.said
+
+
+def test_a_run_whose_last_cycles_are_not_on_record_fails_now_and_in_later_reports(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    append, write = RunFolder.append_cycles, RunFolder.write_table
+
+    def filling(folder: RunFolder, text: str, *, fsync: bool) -> None:
+        if "cycle" not in text and text.count("\n") < 40:  # the rest, after the motion
+            raise Fault("the run folder cannot be written", why="No space left on device")
+        append(folder, text, fsync=fsync)
+
+    def full(folder: RunFolder, name: str, table: Any) -> None:
+        if name == "cycles.csv":
+            raise Fault("cannot be written", why="No space left on device")
+        write(folder, name, table)
+
+    monkeypatch.setattr(RunFolder, "append_cycles", filling)
+    monkeypatch.setattr(RunFolder, "write_table", full)
+    run = tmp_path / "run"
+    answer = call("run", short_plan, "--fast", "--no-camera", "-o", run)
+    assert answer.code == 1
+    (lacking,) = re.findall(r"Of \d+ cycles the last \d+ are not on record", answer.out)
+    assert "free some disk space" in answer.err
+    monkeypatch.undo()
+    assert call("report", run).code == 0
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["verdict"] == "FAILED"
+    assert any(lacking in reason for reason in summary["reasons"])
+
+
+def test_a_working_folder_removed_after_the_motion_leaves_the_verdict(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+
+    def removed(*_: object) -> dict[str, str]:
+        shutil.rmtree(gone)
+        return {"report.html": "No such file or directory"}
+
+    monkeypatch.setattr("executor.runner.write_end", removed)
+    answer = call("run", short_plan, "--fast", "--no-camera", "-o", "run")
+    assert answer.code == 0
+    assert "PASSED" in answer.out
+    assert "the folder was removed during the run" in answer.err
+
+
+@pytest.mark.parametrize("verb", [("report", "run"), ("examples", "hall_10_6")])
+def test_a_working_folder_that_is_gone_is_named(
+    verb: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    one_message(call(*verb), 2, "the current folder was removed", "next: change to a folder")

@@ -57,7 +57,6 @@ def enabled(robot: Rig, group: DriveGroup, rehearsal: SimulatedCia402Rig) -> lis
     return start
 
 
-
 @pytest.mark.parametrize("file", ["gachon_8_6", "hall_10_6", "open_frame_8_6"])
 def test_a_cable_that_is_slack_on_a_stand_is_so_however_elastic_it_is(
     file: str, channel: BusSettings
