@@ -326,17 +326,21 @@ def _fit_from(
 
 
 def _with_fitted_sizes(fit: _Fit, nominal: Sequence[Tag]) -> tuple[Tag, ...] | None:
-    """The tags with sizes that fit the images much better than the stated ones; None if none do.
+    """The tags with sizes that fit the images, where the stated ones do not; else None.
 
-    Images determine sizes relative to each other: most tags have the size that the rig file states.
+    Images determine sizes relative to each other: at least half of the tags must have the size that
+    the rig file states.
     """
     if fit.error <= GOOD_ERROR:
         return None
     cameras, tags = adjust_bundle(fit.views, fit.cameras, fit.tags, with_sizes=True)
-    if rms(np.array(fit.views.image_errors(cameras, tags))[:, None]) >= _BETTER * fit.error:
+    error = float(rms(np.array(fit.views.image_errors(cameras, tags))[:, None]))
+    if error >= min(_BETTER * fit.error, FAILED_ERROR):
         return None
     factors = np.array([tag.size / own.size for tag, own in zip(tags, nominal, strict=True)])
     alike = np.sum(np.abs(factors[:, None] / factors - 1.0) < SIZE_ERROR, axis=1)
+    if 2 * alike.max() < len(tags):
+        return None
     scale = align_to_nominal(tags, nominal, None)[1]
     unit = min(zip(-alike, np.abs(np.log(scale / factors)), factors, strict=True))[2]
     return tuple(

@@ -247,6 +247,20 @@ def test_two_tags_of_other_sizes_with_exchanged_numbers_are_named(rig: Rig) -> N
     assert found.has_failed
 
 
+def test_no_size_is_stated_if_less_than_half_of_the_tags_have_theirs(rig: Rig) -> None:
+    numbers = [tag.id for tag in rig.platform_tags]
+    tags = sized(
+        rig.platform_tags, dict(zip(numbers, (0.8, 0.9, 1.0, 1.05, 1.1, 1.2), strict=True))
+    )
+    observations = session(rig, tags, 16, seed=2)
+    wrong = mistaken(rig, lambda own: [replace(tag, size=0.09) for tag in own])
+    verdict = judge_layout(measure_layout(wrong, rig.cameras[0], observations), 0.2e-3)
+    assert any(
+        step.startswith("check sizes and numbers of the tags") for step in verdict.next_steps
+    )
+    assert not any("wide" in reason for reason in verdict.reasons)
+
+
 @pytest.mark.parametrize("factor", [0.6, 0.9, 1.04])
 def test_a_tag_of_wrong_size_is_named_alone(rig: Rig, factor: float) -> None:
     tags = sized(rig.platform_tags, {304: factor})
