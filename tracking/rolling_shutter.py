@@ -276,7 +276,7 @@ class ClockOffset:
     speed: float
 
     def shows(self, parts: tuple[float, float], covariance: Array, least: float) -> bool:
-        """Whether a sum of parts of both ends exceeds 3σ and moves the platform by ``least``, [m]."""
+        """Whether a sum of parts of both ends exceeds 3σ, and at this speed a distance [m]."""
         value, sigma = abs(float(self.late @ parts)), np.sqrt(parts @ covariance @ parts)
         return bool(value >= 3.0 * sigma and value * self.speed >= least)
 
