@@ -321,7 +321,7 @@ def clock_offset(
     # Without its own position, whose noise would otherwise look like an offset.
     velocity = (positions[2:] - positions[:-2]) / spans[:, None]
     now = np.column_stack([np.ones(len(spans)), within[:, 4] - times.mean()])
-    whiten = np.linalg.cholesky(np.linalg.inv(within[:, 8:].reshape(-1, 3, 3)))
+    stated, unstated = within[:, 8:].reshape(-1, 3, 3), 0.0
     fit: Array = np.zeros(17)
     prior, scale, step = np.zeros((17, 17)), 1.0, np.inf
     prior[:12, :12] = known
@@ -335,12 +335,18 @@ def clock_offset(
         after = np.where(within[:, 4] >= step, 1.0, 0.0)
         row = _clock_rows(there - there[used][0], velocity, now, after)
         gap = within[:, 5:8] - there + velocity * shift[:, None]
-        row, gap = (np.einsum("nji,nj...->ni...", whiten[used], x[used]) for x in (row, gap))
+        spread = stated[used] + unstated * np.eye(3)
+        whiten = np.linalg.cholesky(np.linalg.inv(spread))
+        row, gap = (np.einsum("nji,nj...->ni...", whiten, x[used]) for x in (row, gap))
         normal = np.tensordot(row, row, ((0, 1), (0, 1)))
         pull = np.tensordot(row, gap, ((0, 1), (0, 1)))
         fit = np.asarray(np.linalg.solve(normal / scale + prior, pull / scale), dtype=float)
         left = gap - row @ fit
         scale = _scatter(left)
+        # Errors beyond those stated are added, as single images may state too small ones.
+        pulls = np.einsum("nij,nj->ni", whiten, left)
+        beyond = (float(np.sum(left**2)) - left.size + 17) / max(float(np.sum(pulls**2)), 1e-30)
+        unstated = max(0.0, unstated + beyond)
         if number >= BEFORE_STEP:
             step = within[used, 4][_likely_step(left + row[:, :, 14:] @ fit[14:])]
     then = np.column_stack([np.ones(2), np.array(ends) - times.mean()])
