@@ -11,7 +11,13 @@ from pydantic import Field
 
 from calibration.extrinsics.result import AXES, SCALES, pose_rows
 from calibration.report import Section, page_of, table_of
-from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
+from calibration.results import (
+    CalibrationVerdict,
+    Issue,
+    ResultDocument,
+    beyond,
+    common_keys,
+)
 from calibration.statistics import Interval
 from calibration.tag_map.bundle_adjustment import TagLayout
 from model.errors import BadInput
@@ -260,7 +266,7 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
     issues = [*_image_issues(result), *_tag_issues(result)]
     error = result.error
     if not error <= wanted:
-        what = f"tags are located within {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
+        what = f"tags are located within {beyond(error, wanted)}"
         issues.append(Issue(what, "take more images, closer, sharp and from all sides"))
     return CalibrationVerdict.of(error, wanted, "in the tags' positions", issues)
 
