@@ -55,7 +55,7 @@ _DEFINED = 1e-3
 _CONTRADICTION = (10e-3, np.radians(2.0))
 """Poses with more noise than this are not those of the images, [m] and [rad]."""
 _SIGNIFICANT = 4.0
-"""A test value, or a number of the tags' frame, of so many deviations is not by chance."""
+"""Deviations from which a test value, or a number of the tags' frame, is not by chance."""
 _LEAST_CHANGE = 2e-3
 """Smaller relative errors of distances do not matter."""
 _BLOCKS = (5, 10)
@@ -410,7 +410,7 @@ def _frame_issue(offset: Array) -> Issue:
     )
     step = (
         "check the tags' positions in the rig file, and that the poses are those of the platform's"
-        " frame, not of another body on it"
+        " frame, not of another body on it and not inverse"
     )
     return Issue(what, step)
 
