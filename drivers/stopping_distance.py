@@ -12,7 +12,7 @@ from drivers.can_load import heartbeat_timeout
 from model.errors import Refused
 from model.files.rig_file import Cia402Document, OdriveDocument
 from model.kinematics import cables_to, structure_matrix_of
-from model.pose import Array
+from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Load
 from model.statics.gravity import largest_lever
@@ -116,6 +116,31 @@ def coasting_distance(
     spread = hypot(1.0, lever / radius) if turns else 1.0
     energy = 0.5 * mass * (spread * rig.motion.speed) ** 2
     return hypot(1.0, rig.reach / radius) * (sqrt(2.0 * energy / weakest) + energy / margin)
+
+
+def stopping_remarks(
+    rig: Rig, loads: Sequence[Load], waypoints: Sequence[Pose], clearance: float, margin: float
+) -> list[str]:
+    """Why a run of a path may be refused, if its obstacles are too close to stop before them.
+
+    The run itself decides, by its set-points, of which these are only the waypoints.
+
+    Args:
+        rig: The robot, whose motion has the path's speed.
+        loads: Payloads carried along the path.
+        waypoints: Of the path.
+        clearance: Proved for the whole path, [m]; infinite without obstacles.
+        margin: Smallest capacity margin of the path, [N].
+    """
+    positions = np.array([pose.position for pose in waypoints])
+    rotations = np.array([pose.rotation for pose in waypoints])
+    turns = bool(np.abs(rotations - rotations[0]).max() > 1e-6)
+    coasting = coasting_distance(rig, loads, positions, rotations, margin, turns=turns)
+    try:
+        require_stopping_room(rig, clearance, coasting, turns=turns)
+    except Refused as refused:
+        return [f"a run at {rig.motion.speed * 1000:.3g} mm/s may be refused: {refused.what}"]
+    return []
 
 
 def require_stopping_room(rig: Rig, clearance: float, coasting: float, *, turns: bool) -> None:

@@ -12,11 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.cameras.files import ImageFolder, ImageOutput, first_gap, natural_order
+from drivers.cameras.files import ImageFolder, ImageOutput, natural_order
+from drivers.cameras.frame_reader import CopyCheck
 from drivers.cameras.live import Frame, LiveCamera, VideoFile
 from executor.cameras.sources import (
     SYNTHETIC,
     cycles_per_image,
+    report_different_videos,
+    report_gap,
     require_camera_source,
     require_one_kind,
     require_plan_used,
@@ -215,17 +218,19 @@ def track_sources(
         for camera, source in sources.items()
     ]
     opened, within = _simultaneous(list(sources), opened, listener)
+    copies = [CopyCheck() for _ in opened]
     is_live = any(length is None for _, length in opened)  # then times are of the monotonic clock
     total = None if is_live else max(length or 0 for _, length in opened)
     result.began = time.time_ns() - (time.monotonic_ns() if is_live else 0)
     with ExitStack() as drawing, listener.progress("tracking", pictures or total) as advance:
         streams: dict[str, Iterator[LoggedImage]] = {}
-        for camera, (frames, length) in zip(sources, opened, strict=True):
+        for camera, (frames, length), check in zip(sources, opened, copies, strict=True):
             target = own_drawing(overlay, camera.name) if overlay and several else overlay
             rate = frames.rate if isinstance(frames, VideoFile) else camera.rate
             draw = drawing.enter_context(_overlay(target, rig, camera, rate, replace_overlay))
+            new = frames if sources[camera] == SYNTHETIC else _without_copies(frames, check)
             streams[camera.name] = track(
-                takewhile(lambda _: not stopped(), islice(frames, pictures)),
+                takewhile(lambda _: not stopped(), islice(new, pictures)),
                 Tracker(rig, camera),
                 result.count,
                 give_up_after=PATIENCE if length is None and not several else None,
@@ -242,7 +247,12 @@ def track_sources(
             raise
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
-    for camera, (frames, _) in zip(sources, opened, strict=True):
+    for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
+        if check.count:
+            listener.remark(
+                f"camera {camera.name}: {check.count} images are exact copies of the one before and"
+                " were not measured: a recorder or converter repeats images instead of lost ones"
+            )
         if isinstance(frames, LiveCamera) and frames.late:
             listener.remark(
                 f"camera {camera.name}: {frames.late} images came late and were skipped, as it is"
@@ -267,18 +277,13 @@ def _simultaneous(
     videos = {name: one for name, one in named.items() if isinstance(one, VideoFile)}
     times = _times_by_name(folders, listener) if len(folders) > 1 else {}
     names = list(times) or [name for folder in folders.values() for name in folder.names]
-    if gap := first_gap(names):
-        listener.remark(
-            f"images seem to be missing between {' and '.join(gap)}: times are those of consecutive"
-            " images, so later ones are too early, and the next poses of a camera with readout_ms"
-            " are wrong"
-        )
+    report_gap(names, listener)
     if times:
         return [
             ((replace(frame, time=times[frame.name]) for frame in folder), len(folder))
             for folder in folders.values()
         ], 0.0
-    _report_different_videos(videos, listener)
+    report_different_videos({name: (len(one), one.rate) for name, one in videos.items()}, listener)
     # The fastest camera defines the time window of simultaneous images.
     return opened, 0.5 / max(camera.rate for camera in cameras)
 
@@ -313,7 +318,7 @@ def _times_by_name(folders: Mapping[str, ImageFolder], listener: Listener) -> di
                 why="images are paired by their names, as a folder does not contain their times",
                 next_step="give images taken at the same time the same name in every folder",
             )
-    order = {name: k for k, name in enumerate(sorted(count, key=natural_order))}
+    order = {name: k for k, name in enumerate(sorted(count, key=natural_order(count)))}
     rates = {
         camera: folders[camera].rate * float(np.median(np.diff([order[name] for name in own])))
         for camera, own in names.items()
@@ -326,16 +331,6 @@ def _times_by_name(folders: Mapping[str, ImageFolder], listener: Listener) -> di
             f" own rate_hz it would be {', '.join(f'{n} {one:.6g}' for n, one in rates.items())}"
         )
     return {name: k / rate for name, k in order.items()}
-
-
-def _report_different_videos(videos: Mapping[str, VideoFile], listener: Listener) -> None:
-    """Remarks on videos of different length or rate: they may not have begun together."""
-    if len({(len(video), round(video.rate, 3)) for video in videos.values()}) > 1:
-        facts = ", ".join(f"{n} {len(v)} at {v.rate:.6g}/s" for n, v in videos.items())
-        listener.remark(
-            f"the videos have different numbers of images or rates ({facts}); images are paired by"
-            " their times from the beginning of each, which must be simultaneous"
-        )
 
 
 def _measure(
@@ -368,6 +363,10 @@ def _together(
         return
     for name, stream in streams.items():
         yield from ((found, {name: found}) for found in stream)
+
+
+def _without_copies(frames: Iterable[SourceImage], check: CopyCheck) -> Iterator[SourceImage]:
+    return (frame for frame in frames if not check.is_copy(frame.image))
 
 
 @contextmanager

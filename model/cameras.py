@@ -194,16 +194,45 @@ _OUTER = 0.1
 """Share of an image's width or height within which, from an edge, a principal point is doubtful."""
 
 
-def principal_point_doubt(camera: CameraDocument) -> str:
+def _principal_point_doubt(camera: CameraDocument) -> str:
     """Why a camera's principal point is doubtful; empty if it is near the image's middle."""
-    x, y = camera.cx_px / camera.width_px, camera.cy_px / camera.height_px
+    width, height = camera.width_px, camera.height_px
+    if _off_middle(camera, height, width) < min(_OUTER, _off_middle(camera, width, height) / 3.0):
+        return (
+            f"the principal point ({camera.cx_px:g}, {camera.cy_px:g}) px is that of an image of"
+            f" {height} x {width} px; check whether width and height, {width} x {height} px, are"
+            " exchanged"
+        )
+    x, y = camera.cx_px / width, camera.cy_px / height
     if min(x, y, 1.0 - x, 1.0 - y) >= _OUTER:
         return ""
     where = "outside" if min(x, y, 1.0 - x, 1.0 - y) < 0.0 else "at the edge of"
     return (
         f"the principal point ({camera.cx_px:g}, {camera.cy_px:g}) px is {where} the image of"
-        f" {camera.width_px} x {camera.height_px} px; check the file, unless the image is cropped"
+        f" {width} x {height} px; check the file, unless the image is cropped"
     )
+
+
+def _off_middle(camera: CameraDocument, width: int, height: int) -> float:
+    """Distance of the principal point from the middle of an image, as a share of its sides."""
+    return max(abs(camera.cx_px / width - 0.5), abs(camera.cy_px / height - 0.5))
+
+
+def lens_remarks(own: CameraDocument, new: CameraDocument, file: str, assumed: str) -> list[str]:
+    """What is assumed or doubtful about a camera's new lens, and what remains to be done.
+
+    Args:
+        own: The camera with its former lens.
+        new: The same camera with the lens of a file.
+        file: The file's name.
+        assumed: What the file does not state and what is assumed instead; empty if nothing.
+    """
+    remarks = [f"{file} has no {assumed}"] if assumed else []
+    if doubt := _principal_point_doubt(new):
+        remarks.append(f"{file}: {doubt}")
+    what = f"the pose of camera {own.name!r} was found with another lens"
+    remarks.append(f"{what}; calibrate it with `cdpr calibrate extrinsics`")
+    return remarks + left_out_errors([own], [new])
 
 
 def _scaled(rows: list[list[float]] | None, scales: Array) -> Array | None:

@@ -55,6 +55,9 @@ def plan_figure(plan: Plan) -> Figure:
 
 def _new(title: str) -> tuple[Figure, Any]:
     figure = plt.figure(figsize=(7.0, 6.0), layout="constrained")
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.set(rect=(0.0, 0.0, 0.93, 1.0))  # type: ignore[call-arg]  # else the label of z is cut
     axes = figure.add_subplot(projection="3d")
     axes.set_title(title)
     return figure, axes

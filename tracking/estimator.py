@@ -8,6 +8,7 @@ the body's, and of a tag detected twice the square that fits it is used.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -30,6 +31,7 @@ from tracking.edges.refine import refine
 from tracking.measurement import (
     CAUSE,
     ROTATED,
+    SEEN_TWICE,
     UNSHARP,
     NoPose,
     Observation,
@@ -64,8 +66,8 @@ class Consensus:
 
     Attributes:
         views: At most one per tag.
-        ambiguous: Numbers of tags detected more than once, if it is unknown which is the body's;
-            then there are no views.
+        ambiguous: Numbers of the tags of two such sets, if it is unknown which is the body's; then
+            there are no views.
     """
 
     views: list[TagView]
@@ -98,8 +100,8 @@ def find_consensus(
     for count, _, pose, others in found[1:]:
         elsewhere = not chosen & {id(view) for view in others}
         if count == most and elsewhere and pose.distance_to(best) > SAME:
-            twice = sorted({view.tag.id for view in (*members, *others)})
-            return Consensus([], tuple(twice))
+            both = sorted({view.tag.id for view in (*members, *others)})
+            return Consensus([], tuple(both))
     return Consensus(members)
 
 
@@ -120,6 +122,16 @@ def _fitting(
         if near and (view.tag.id not in best or gap < best[view.tag.id][0]):
             best[view.tag.id] = (gap, view)
     return best
+
+
+def _ambiguity(views: Sequence[TagView], ambiguous: Sequence[int]) -> str:
+    """Why it is unknown which detected tags are the body's."""
+    count = Counter(view.tag.id for view in views)
+    twice = [number for number in ambiguous if count[number] > 1]
+    several = twice or ambiguous
+    tags = f"tag{'s' * (len(several) > 1)} {', '.join(map(str, several))}"
+    are = "are" if len(several) > 1 else "is"
+    return f"{tags} {are} {SEEN_TWICE if twice else 'detected at inconsistent positions'}"
 
 
 LIKELY_TAG_ERROR = 5e-5
@@ -206,8 +218,7 @@ class PlatformEstimator:
         detected = views
         agreed = find_consensus(self._camera, views, lambda pose: not self._impossible(views, pose))
         if agreed.ambiguous:
-            twice = ", ".join(map(str, agreed.ambiguous))
-            return NoPose(time, f"tags {twice} are detected at inconsistent positions", seen)
+            return NoPose(time, _ambiguity(views, agreed.ambiguous), seen)
         views = list(agreed.views)
         prior = None if expected is None else self._camera_from_world.compose(expected)
         first = solve_pnp(self._camera, views, prior) if views else None

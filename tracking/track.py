@@ -23,7 +23,14 @@ from tracking.clearance import MeasuredClearance, clearance_of, require_stated_e
 from tracking.detection.diagnostics import MIRRORED, SOFT, UNMIRROR, diagnose_tags, edge_width
 from tracking.detection.tags import mounted_rotated, tag_corners
 from tracking.fusion import DISAGREE, MultiCameraFusion, synchronize_frames
-from tracking.measurement import ROTATED, UNCERTAIN, UNSHARP, Observation, PoseMeasurement
+from tracking.measurement import (
+    ROTATED,
+    SEEN_TWICE,
+    UNCERTAIN,
+    UNSHARP,
+    Observation,
+    PoseMeasurement,
+)
 from tracking.pose_log import LoggedImage
 from tracking.shared_errors import PERHAPS_MOVED
 from tracking.tracker import Tracker
@@ -152,7 +159,7 @@ def _nothing_seen(
     where = f"camera {tracker.camera.name!r}"
     if last is None:
         return NoPlatformSeen("the source has no images", where=where)
-    wanted = ", ".join(map(str, tracker.expected_tags))
+    wanted, mine = ", ".join(map(str, tracker.expected_tags)), seen & {*tracker.expected_tags}
     instead = diagnose_tags(last.image, tracker.rig.tag_family, tracker.expected_tags)
     next_step = (
         "check that the camera sees the platform, that the light suffices, and that the rig file"
@@ -162,6 +169,9 @@ def _nothing_seen(
     soft = edge_width(last.image) > SOFT
     if MIRRORED in instead:
         next_step = UNMIRROR
+    elif SEEN_TWICE in reason:
+        why = "another print of these tags is in view, such as that of a spare platform"
+        next_step = "remove or cover the second print, or print its tags with other numbers"
     elif UNCERTAIN in reason and not soft:
         next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"
     elif PERHAPS_MOVED in reason:
@@ -176,16 +186,20 @@ def _nothing_seen(
             "rotate the platform back; if it is not rotated so far, check rotation_wxyz of"
             " tags.platform and platform.home in the rig file"
         )
-    elif len(seen & {tag.id for tag in tracker.rig.platform_tags}) > 1:
+    elif len(mine) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
         rotated = _rotated_tags(tracker, last)
         if rotated is not None:
             why, next_step = rotated
+    if not why:
+        why = f"expected {tracker.rig.tag_family} tags {wanted}"
+        if not mine or MIRRORED in instead:
+            why += f"; {last.name} shows {instead}"
     return NoPlatformSeen(
         f"none of {pictures} image{'s' if pictures != 1 else ''} gives a pose of the platform:"
         f" {reason}",
         where=where,
-        why=why or f"expected {tracker.rig.tag_family} tags {wanted}; {last.name} shows {instead}",
+        why=why,
         next_step=next_step,
         values={"pictures": pictures, "family": tracker.rig.tag_family, "expected": wanted},
     )

@@ -2,10 +2,11 @@
 
 None states uncertainties. All have integer coordinates at pixel centres, as rig files do.
 
-Source: OpenCV, samples/cpp/calibration.cpp (keys); ROS, sensor_msgs/CameraInfo and
-camera_calibration_parsers (keys, models plumb_bob, rational_polynomial, equidistant); Kalibr, wiki
-page "yaml formats" (camchain); EuRoC MAV data set, sensor.yaml; mrcal, "Camera model
-representation in memory and on disk".
+Source: OpenCV, calibration.cpp and stereo_calib.cpp of samples/cpp, calibController.cpp of
+apps/interactive-calibration (keys); ROS, sensor_msgs/CameraInfo and camera_calibration_parsers
+(keys, models plumb_bob, rational_polynomial, equidistant); Kalibr, wiki page "yaml formats"
+(camchain); EuRoC MAV data set, sensor.yaml; mrcal, "Camera model representation in memory and on
+disk".
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ import yaml
 from pydantic import ValidationError
 
 from calibration.intrinsics.result import camera_named, with_camera
-from model.cameras import camera_from, is_camera_matrix, left_out_errors, principal_point_doubt
+from model.cameras import camera_from, is_camera_matrix, lens_remarks
 from model.errors import BadInput
 from model.files.camera_file import FISHEYE, CameraDocument
 from model.files.documents import read_yaml, write_atomic
@@ -46,16 +47,26 @@ _SMALL, _TEXT_LIMIT = 1_000_000, 32_000_000
 """Largest files in characters, OpenCV's and any; mrcal's may include all corners."""
 _BAD_NUMBERS = (TypeError, ValueError, OverflowError, RecursionError, AttributeError)
 """Exceptions from values that are not numbers, and from PyYAML's constructors."""
+_SIDES, _STEREO = ("image_width", "image_height"), ("m1", "m2")
 _MATRIX, _LIST = "nine numbers, or rows, cols and data", "a list of numbers, or rows, cols and data"
 _FORMS = {
-    **dict.fromkeys(("image_width", "image_height", "width", "height"), "a number of pixels"),
-    **dict.fromkeys(("camera_matrix", "k"), _MATRIX),
-    **dict.fromkeys(("distortion_coefficients", "distortion_coeffs", "d"), _LIST),
-    **dict.fromkeys(("resolution", "imagersize"), "width and height"),
+    **dict.fromkeys((*_SIDES, "width", "height"), "a number of pixels"),
+    **dict.fromkeys(("camera_matrix", "cameramatrix", "k", "m1", "m2"), _MATRIX),
+    **dict.fromkeys(("distortion_coefficients", "distortion_coeffs", "dist_coeffs"), _LIST),
+    **dict.fromkeys(("d", "d1", "d2"), _LIST),
+    **dict.fromkeys(("resolution", "imagersize", "cameraresolution"), "width and height"),
     "intrinsics": "fx, fy, cx, cy",
     "fisheye_model": "0 or 1",
 }
 """What is expected of each key."""
+_BY_MATRIX = {
+    "camera_matrix": (_SIDES, "distortion_coefficients"),  # OpenCV, ROS's parsers
+    "cameramatrix": (("cameraresolution",), "dist_coeffs"),  # OpenCV's interactive-calibration
+    "k": (("width", "height"), "d"),  # a message of ROS; ROS 1 names its fields K and D
+    "intrinsics": (("resolution",), "distortion_coefficients"),  # EuRoC
+    **{f"m{k}": (_SIDES, f"d{k}") for k in (1, 2)},  # OpenCV's stereo_calib, without the size
+}
+"""Keys of the image's size and of the lens by that of the matrix, in lower case."""
 _KEYS = ("width_px", "height_px", "fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens")
 
 
@@ -182,19 +193,8 @@ def _with_lens(camera: CameraDocument, found: Mapping[str, Any], path: Path) -> 
         raise _unusable(path, f"{'.'.join(map(str, first['loc']))}: {first['msg']}") from None
 
 
-def _remarks(own: CameraDocument, new: CameraDocument, path: Path, assumed: bool) -> list[str]:
-    """What is assumed or doubtful about a file, and what remains to be done after its import."""
-    what = f"the pose of camera {own.name!r} was found with another lens"
-    remarks = [f"{what}; calibrate it with `cdpr calibrate extrinsics`"]
-    if doubt := principal_point_doubt(new):
-        remarks.insert(0, f"{path.name}: {doubt}")
-    if assumed:
-        remarks.insert(0, f"{path.name} has no distortion_model; plumb_bob is assumed, as by ROS")
-    return remarks + left_out_errors([own], [new])
-
-
-def _found(path: Path, entry: str | None) -> dict[str, Any]:
-    """Keys of the rig file's ``cameras``, from a file, and whether the lens model is assumed."""
+def _found(path: Path, entry: str | None, own: CameraDocument) -> dict[str, Any]:
+    """Keys of the rig file's ``cameras``, from a file, and what of them is assumed."""
     text = read_text(path, _TEXT_LIMIT)
     if "lensmodel" in text and _without_comments(text).startswith("{"):
         found = _from_mrcal(text, path)
@@ -203,10 +203,25 @@ def _found(path: Path, entry: str | None) -> dict[str, Any]:
         if any(_is_entry(key) for key in plain):
             return _from_kalibr(plain, path, entry)
         keys = {str(key).lower(): value for key, value in plain.items()}
-        found = _from_keys(keys, path, is_opencv)
+        at = next((key for key in _BY_MATRIX if key in keys), "")
+        if at in _STEREO:
+            pair = [key.upper() for key in _STEREO if key in keys]
+            at, size = _chosen(pair, entry, path).lower(), (own.width_px, own.height_px)
+            found = _from_keys(dict(zip(_SIDES, size, strict=True)) | keys, at, path, True)
+            unknown = f"image size; that of the rig file, {size[0]} x {size[1]} px, is assumed"
+            return found | {"assumed": "" if keys.keys() & _SIDES else unknown}
+        found = _from_keys(keys, at, path, is_opencv)
     if entry is not None:
         raise _unusable(path, f"it has one camera, so {entry!r} does not exist")
     return found
+
+
+def _chosen(names: list[str], entry: str | None, path: Path) -> str:
+    if entry is None and len(names) > 1:
+        raise _unusable(path, f"it has {', '.join(names)}; choose one with --entry")
+    if (name := entry or names[0]) not in names:
+        raise _unusable(path, f"it has {', '.join(names)}, but not {name!r}")
+    return name
 
 
 def _content(text: str, path: Path) -> tuple[Mapping[Any, Any], bool]:
@@ -221,8 +236,8 @@ def _content(text: str, path: Path) -> tuple[Mapping[Any, Any], bool]:
         raise _unusable(path, f"it is damaged: {' '.join(str(error).split())}"[:200]) from None
     if not isinstance(plain, Mapping):
         raise _unusable(path, "it has no keys")
-    matrix = plain.get("camera_matrix")
-    return plain, is_opencv or (isinstance(matrix, Mapping) and "type_id" in matrix)
+    nodes = (node for node in plain.values() if isinstance(node, Mapping))
+    return plain, is_opencv or any("type_id" in node for node in nodes)
 
 
 def _message(text: str, path: Path) -> Any:
@@ -254,7 +269,7 @@ def write_rig_with_camera(
         rig: The robot.
         name: Of the camera, which keeps its pose and rate.
         path: A file in one of `FORMATS`, detected by content.
-        entry: Which camera of a Kalibr camchain, such as ``cam1``; the only one when left out.
+        entry: Which camera of Kalibr's camchain or OpenCV's stereo_calib, such as ``cam1``, ``M2``.
         listener: Receives the remarks.
 
     Raises:
@@ -268,16 +283,15 @@ def write_rig_with_camera(
             why="an import never replaces a rig file",
             next_step="choose a name that does not exist yet",
         )
-    own, found = camera_named(rig.document, name), _found(path, entry)
+    own = camera_named(rig.document, name)
+    found = _found(path, entry, own)
     new = _with_lens(own, found, path)
-    document = with_camera(rig.document, new)
-    rig_from_document(document)
+    rig_from_document(document := with_camera(rig.document, new))
     plain = document.model_dump(mode="json", exclude_unset=True)
     body = yaml.safe_dump(plain, sort_keys=False, allow_unicode=True, default_flow_style=None)
     head = [f"{rig.name} with camera {name} of {path.name}; written by `cdpr calibrate import`"]
-    remarks = _remarks(own, new, path, found["assumed"])
-    comments = "".join(f"# {line}\n" for line in head + remarks)
-    write_atomic(output, f"{comments}{body}")
+    remarks = lens_remarks(own, new, path.name, found["assumed"])
+    write_atomic(output, "".join(f"# {line}\n" for line in head + remarks) + body)
     for remark in remarks:
         listener.remark(remark)
     return new
@@ -301,28 +315,24 @@ def _opencv_xml(text: str) -> Mapping[str, Any]:
     return found
 
 
-def _from_keys(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> dict[str, Any]:
-    """The camera of OpenCV, ROS or EuRoC; the keys are in lower case."""
-    if "camera_matrix" in keys:  # of OpenCV, or of ROS's camera_calibration_parsers
-        size = np.concatenate([_at(keys, f"image_{axis}", path) for axis in ("width", "height")])
-        matrix, lens = _at(keys, "camera_matrix", path), "distortion_coefficients"
-    elif "k" in keys:  # a message of ROS; ROS 1 names its fields K and D
-        size = np.concatenate([_at(keys, axis, path) for axis in ("width", "height")])
-        matrix, lens = _at(keys, "k", path), "d"
-    elif "intrinsics" in keys:
-        size, matrix = (_at(keys, key, path) for key in ("resolution", "intrinsics"))
-        lens = "distortion_coefficients"
-        if (model := keys.get("camera_model", "pinhole")) != "pinhole":
-            raise _unusable(path, f"its camera_model is {model!r}; pinhole can be read")
-    else:
-        raise _unusable(path, "it has none of the keys camera_matrix, K, intrinsics, cam0")
+def _from_keys(keys: Mapping[str, Any], at: str, path: Path, is_opencv: bool) -> dict[str, Any]:
+    """The camera of OpenCV, ROS or EuRoC with its matrix at a key; keys are in lower case."""
+    if not at:
+        names = "camera_matrix, cameraMatrix, K, intrinsics, M1, cam0"
+        raise _unusable(path, f"it has none of the keys {names}")
+    if at == "intrinsics" and (model := keys.get("camera_model", "pinhole")) != "pinhole":
+        raise _unusable(path, f"its camera_model is {model!r}; pinhole can be read")
+    sides, lens = _BY_MATRIX[at]
+    size, matrix = np.concatenate([_at(keys, side, path) for side in sides]), _at(keys, at, path)
     _require_whole_image(keys, size, path)
+    is_opencv = is_opencv if at == "camera_matrix" else at in ("cameramatrix", *_STEREO)
     (kind, count), is_assumed = _lens_of(keys, path, is_opencv)
     numbers = _at(keys, lens, path)
     if numbers[count:].any():  # some drivers add zeros
         model = keys.get("distortion_model", kind)
         raise _unusable(path, f"{model} has {count} coefficients, not {len(numbers)}")
-    return _numbers(path, size, matrix, numbers[:count], kind) | {"assumed": is_assumed}
+    assumed = "distortion_model; plumb_bob is assumed, as by ROS" if is_assumed else ""
+    return _numbers(path, size, matrix, numbers[:count], kind) | {"assumed": assumed}
 
 
 def _lens_of(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> tuple[tuple[str, int], bool]:
@@ -340,7 +350,7 @@ def _lens_of(keys: Mapping[str, Any], path: Path, is_opencv: bool) -> tuple[tupl
         if model is not None and model[0] != own[0]:
             raise _unusable(path, f"distortion_model {stated!r} contradicts its fisheye_model")
         return model or own, False
-    if model is None and "camera_matrix" not in keys:
+    if model is None and not is_opencv and "camera_matrix" not in keys:
         raise _unusable(path, f"distortion_model is missing: one of {', '.join(_MODELS)}")
     return model or _ANY, model is None and not is_opencv
 
@@ -350,6 +360,7 @@ def _at(keys: Mapping[Any, Any], key: str, path: Path, where: str = "") -> Array
     if key not in keys:
         raise _unusable(path, f"{where}{key} is missing: {_FORMS[key]}")
     node = keys[key].get("data") if isinstance(keys[key], Mapping) else keys[key]
+    node = node.split() if isinstance(node, str) else node  # OpenCV's XML has lists as text
     try:
         numbers = np.ravel(np.asarray(node, np.float64))
     except _BAD_NUMBERS:
@@ -376,11 +387,7 @@ def _is_entry(key: object) -> bool:
 
 def _from_kalibr(plain: Mapping[Any, Any], path: Path, entry: str | None) -> dict[str, Any]:
     names = [str(key) for key in plain if _is_entry(key)]
-    if entry is None and len(names) > 1:
-        raise _unusable(path, f"it has {', '.join(names)}; choose one with --entry")
-    name = entry or names[0]
-    if name not in names:
-        raise _unusable(path, f"it has {', '.join(names)}, but not {name!r}")
+    name = _chosen(names, entry, path)
     own, where = plain[name] if isinstance(plain[name], Mapping) else {}, f"{name}: "
     kind, model = str(own.get("camera_model")), str(own.get("distortion_model"))
     if kind != "pinhole" or model not in _KALIBR_MODELS:
@@ -430,7 +437,7 @@ def _numbers(path: Path, size: Array, matrix: Array, lens: Array, kind: str) -> 
         matrix = matrix[[0, 4, 2, 5]]
     pixels = [int(side) if side.is_integer() else side for side in size.tolist()]
     values = (*pixels, *matrix.tolist(), lens.tolist(), kind)
-    return dict(zip(_KEYS, values, strict=True)) | {"assumed": False}
+    return dict(zip(_KEYS, values, strict=True)) | {"assumed": ""}
 
 
 def _unusable(path: Path, why: str) -> BadInput:

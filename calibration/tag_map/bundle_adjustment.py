@@ -8,18 +8,24 @@ is summed as in `calibration.intrinsics.calibrate`.
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from calibration.extrinsics.result import widths_of
-from calibration.tag_map.observations import TagObservations, TagViews, moved_tags
+from calibration.tag_map.observations import (
+    TagObservations,
+    TagViews,
+    connected_tags,
+    initial_layout,
+    moved_tags,
+)
 from model.errors import BadInput
 from model.pose import Array, Pose, moved, read_only, skew
 from model.rig import Camera, Rig, Tag
+from tracking.camera_model import rms
 from tracking.detection.tags import tag_corners
 from tracking.pnp import TagView, solve_pnp
 
@@ -31,6 +37,10 @@ HUBER = 3.0
 _NARROWING = (1e4, 1e2, 2e1, HUBER)
 _FAR_OFF_PX = 2.0
 """Corner errors above this mean that an image does not show this platform as it is."""
+_BETTER = 0.5
+"""Another fit is preferred if its error is less than this share of the first one's."""
+GOOD_ERROR, FAILED_ERROR = 0.3, 1.0
+"""Required reprojection error, and that above which a fit describes no layout, [px]."""
 
 
 def outlier_image(observations: TagObservations, errors: Sequence[float]) -> dict[str, str]:
@@ -44,7 +54,7 @@ def outlier_image(observations: TagObservations, errors: Sequence[float]) -> dic
 def initial_poses(
     camera: Camera, nominal: Mapping[int, Tag], observations: TagObservations
 ) -> tuple[dict[str, Pose], TagObservations]:
-    """``camera_from_platform`` of each image by the rig file's tags; drops images without."""
+    """``camera_from_platform`` of each image by tags at given poses; drops images without."""
     starts = {}
     for name, squares in observations.squares.items():
         found = solve_pnp(camera, [TagView(nominal[k], s) for k, s in squares.items()])
@@ -59,29 +69,39 @@ def initial_poses(
 
 
 def adjust_bundle(
-    views: TagViews, cameras: Sequence[Pose], tags: tuple[Tag, ...]
+    views: TagViews, cameras: Sequence[Pose], tags: tuple[Tag, ...], with_sizes: bool = False
 ) -> tuple[list[Pose], tuple[Tag, ...]]:
-    """Fitted camera poses and tags; the first tag stays fixed meanwhile."""
+    """Fitted camera poses and tags; the first tag stays fixed meanwhile.
+
+    Args:
+        views: Of the tags.
+        cameras: ``camera_from_platform`` of each image, to start from.
+        tags: To start from.
+        with_sizes: Whether sizes relative to the first tag are fitted, too.
+    """
     count = 6 * len(cameras)
+    last = count + 6 * (len(tags) - 1)
 
     def at(x: Array) -> tuple[list[Pose], tuple[Tag, ...]]:
         steps = x[:count].reshape(-1, 6)
-        own = np.concatenate([np.zeros(6), x[count:]])
+        own = moved_tags(tags, np.concatenate([np.zeros(6), x[count:last]]))
+        factors = np.exp(x[last:]).tolist()
+        sized = [replace(tag, size=tag.size * k) for tag, k in zip(own[1:], factors, strict=False)]
         return (
             [moved(pose, step) for pose, step in zip(cameras, steps, strict=True)],
-            moved_tags(tags, own),
+            (own[0], *sized) if with_sizes else own,
         )
 
     def slopes(x: Array) -> Array:
-        whole = views.dense_slopes(*at(x))
-        return np.delete(whole, np.s_[count : count + 6], axis=1)
+        whole = np.delete(views.dense_slopes(*at(x)), np.s_[count : count + 6], axis=1)
+        return np.hstack([whole, views.size_slopes(*at(x))[:, 1:]]) if with_sizes else whole
 
     # The rig file may be many deviations off, where Huber's loss has little gradient: so its scale
     # narrows. Each round restarts at the last result: steps are small rotations of current poses.
     for scale in _NARROWING:
         found = least_squares(
             lambda x: views.errors(*at(x)).ravel(),
-            np.zeros(count + 6 * (len(tags) - 1)),
+            np.zeros(last + (len(tags) - 1) * with_sizes),
             jac=slopes,
             loss="huber",
             f_scale=scale,
@@ -139,43 +159,10 @@ def fix_gauge(tags: Sequence[Tag], fixed: int | None) -> Array:
     return np.concatenate([slopes.sum(axis=0), turns / 0.05])
 
 
-# Locatable tags: those that images connect to each other, whichever image is left out. What hangs
-# on one image alone has no jackknife, and an error of that image would go unnoticed.
-
-
-def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) -> list[int]:
-    """The largest group of tags that stay connected without any one of the images.
-
-    Args:
-        pictures: Tag numbers in each image.
-        fixed: Select the group of this tag instead.
-
-    Returns:
-        Their numbers in order; empty when no two images show the same tag.
-    """
-    counts = Counter(frozenset(numbers) for numbers in pictures)
-    groups = _groups(counts)
-    for single in [numbers for numbers, count in counts.items() if count == 1]:
-        parts = _groups(counts.keys() - {single})
-        groups = [group & part for group in groups for part in parts if group & part]
-    if fixed is not None:
-        groups = [group for group in groups if fixed in group]
-    largest: set[int] = max(groups, key=lambda group: (len(group), -min(group)), default=set())
-    return sorted(largest)
-
-
-def _groups(pictures: Iterable[frozenset[int]]) -> list[set[int]]:
-    """Groups of tags that images connect."""
-    groups: list[set[int]] = []
-    for numbers in pictures:
-        tied = [group for group in groups if group & numbers]
-        groups = [group for group in groups if not group & numbers]
-        groups.append(set(numbers).union(*tied))
-    return groups
-
-
 LEAST_IMAGES = 4
 """Images of two tags or more; twenty are good."""
+SIZE_ERROR = 0.02
+"""Relative deviation from which a tag's size or the layout's counts as wrong."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,6 +181,8 @@ class TagLayout:
         unseen: Why each other tag keeps its pose of the rig file, by tag number.
         sides: Largest angle between directions from which images were taken, [rad].
         scale: Size of the layout relative to the rig file.
+        resized: The tags with fitted sizes, where the stated ones contradict the images.
+        family: Of the tags.
         unused: Why images are not used, by name.
         data_hash: Of the observations.
     """
@@ -208,6 +197,8 @@ class TagLayout:
     unseen: Mapping[int, str]
     sides: float
     scale: float
+    resized: tuple[Tag, ...] | None
+    family: str
     unused: Mapping[str, str]
     data_hash: str
 
@@ -224,6 +215,11 @@ class TagLayout:
     def reprojection(self) -> float:
         """RMS corner error over the images, [px]."""
         return float(np.sqrt(np.mean(np.square(list(self.errors.values())))))
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether no layout fits the images, so that the tags' poses mean nothing."""
+        return self.reprojection > FAILED_ERROR
 
 
 def require_tags(rig: Rig, fixed: int | None) -> None:
@@ -271,22 +267,86 @@ def measure_layout(
         if len(squares) < 2
     }
     observations = observations.without(single).without_duplicates(camera)
-    starts, observations = initial_poses(camera, nominal, observations)
-    located = connected_tags([tuple(squares) for squares in observations.squares.values()], fixed)
-    used = _only_located(observations, located, fixed)
-    if len(used.squares) < LEAST_IMAGES:
-        raise _too_few(used, fixed)
-    tags = tuple(nominal[number] for number in located)
-    views = TagViews.of(camera, used, tags)
-    fit = adjust_bundle(views, [starts[name] for name in used.squares], tags)
-    if outliers := outlier_image(used, views.image_errors(*fit)):
-        return measure_layout(rig, camera, observations.without(outliers), fixed)
+    fit = _best_fit(camera, nominal, observations, fixed)
+    if len(fit.used.squares) < LEAST_IMAGES:
+        raise _too_few(fit.used, fixed)
+    original = tuple(nominal[tag.id] for tag in fit.tags)
+    resized = _with_fitted_sizes(fit, original)
+    if resized is None and (outliers := outlier_image(fit.used, fit.errors)):
+        return measure_layout(rig, camera, fit.posed.without(outliers), fixed)
+    located = [tag.id for tag in fit.tags]
     unseen = {
-        number: _unseen_reason(number, observations, located)
+        number: _unseen_reason(number, fit.posed, located)
         for number in nominal
         if number not in located
     }
-    return _result(tags, unseen, views, *fit, fixed, used)
+    return _result(original, unseen, fit, fixed, resized, rig.tag_family)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """A joint fit; without cameras and errors where too few images are left."""
+
+    posed: TagObservations  # images with an initial camera pose
+    used: TagObservations  # the located tags in them
+    views: TagViews
+    cameras: list[Pose]
+    tags: tuple[Tag, ...]
+    errors: list[float]  # of each image, [px]
+
+    @property
+    def error(self) -> float:
+        return float(rms(np.array(self.errors)[:, None])) if self.errors else np.inf
+
+
+def _best_fit(
+    camera: Camera, nominal: Mapping[int, Tag], observations: TagObservations, fixed: int | None
+) -> _Fit:
+    """The fit from the rig file's layout or, if that leads nowhere, from the images' own."""
+    fit = _fit_from(camera, nominal, observations, fixed)
+    if max(fit.errors, default=np.inf) <= _FAR_OFF_PX:
+        return fit
+    own = initial_layout(camera, nominal, observations)
+    other = _fit_from(camera, own, observations, fixed)
+    return other if other.error < _BETTER * fit.error else fit
+
+
+def _fit_from(
+    camera: Camera, start: Mapping[int, Tag], observations: TagObservations, fixed: int | None
+) -> _Fit:
+    starts, observations = initial_poses(camera, start, observations)
+    located = connected_tags([tuple(squares) for squares in observations.squares.values()], fixed)
+    used = _only_located(observations, located, fixed)
+    tags = tuple(start[number] for number in located)
+    views = TagViews.of(camera, used, tags)
+    if len(used.squares) < LEAST_IMAGES:
+        return _Fit(observations, used, views, [], tags, [])
+    cameras, tags = adjust_bundle(views, [starts[name] for name in used.squares], tags)
+    return _Fit(observations, used, views, cameras, tags, views.image_errors(cameras, tags))
+
+
+def _with_fitted_sizes(fit: _Fit, nominal: Sequence[Tag]) -> tuple[Tag, ...] | None:
+    """The tags with sizes that fit the images, where the stated ones do not; else None.
+
+    Images determine sizes relative to each other: at least half of the tags must have the size that
+    the rig file states.
+    """
+    if fit.error <= GOOD_ERROR:
+        return None
+    cameras, tags = adjust_bundle(fit.views, fit.cameras, fit.tags, with_sizes=True)
+    error = float(rms(np.array(fit.views.image_errors(cameras, tags))[:, None]))
+    if error >= min(_BETTER * fit.error, FAILED_ERROR):
+        return None
+    factors = np.array([tag.size / own.size for tag, own in zip(tags, nominal, strict=True)])
+    alike = np.sum(np.abs(factors[:, None] / factors - 1.0) < SIZE_ERROR, axis=1)
+    if 2 * alike.max() < len(tags):
+        return None
+    scale = align_to_nominal(tags, nominal, None)[1]
+    unit = min(zip(-alike, np.abs(np.log(scale / factors)), factors, strict=True))[2]
+    return tuple(
+        Tag(tag.id, tag.size / unit, Pose(tag.pose.position / unit, tag.pose.rotation))
+        for tag in tags
+    )
 
 
 def _only_located(
@@ -316,15 +376,15 @@ def _unseen_reason(number: int, observations: TagObservations, located: Collecti
 def _result(
     nominal: tuple[Tag, ...],
     unseen: Mapping[int, str],
-    views: TagViews,
-    cameras: list[Pose],
-    tags: tuple[Tag, ...],
+    fit: _Fit,
     fixed: int | None,
-    observations: TagObservations,
+    resized: tuple[Tag, ...] | None,
+    family: str,
 ) -> TagLayout:
-    shift, scale = align_to_nominal(tags, nominal, fixed)
-    tags = tuple(replace(tag, pose=shift.compose(tag.pose)) for tag in tags)
-    cameras = [pose.compose(shift.inverse()) for pose in cameras]
+    observations, views = fit.used, fit.views
+    shift, scale = align_to_nominal(fit.tags, nominal, fixed)
+    tags = tuple(replace(tag, pose=shift.compose(tag.pose)) for tag in fit.tags)
+    cameras = [pose.compose(shift.inverse()) for pose in fit.cameras]
     informations, scores, misfit = views.tag_information(cameras, tags, HUBER)
     gauge = fix_gauge(tags, fixed)
     whole = np.sum(informations, axis=0)
@@ -346,6 +406,8 @@ def _result(
         unseen=unseen,
         sides=_sides(cameras),
         scale=scale,
+        resized=resized,
+        family=family,
         unused=observations.unused,
         data_hash=observations.data_hash(),
     )

@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,7 @@ from tracking.detection.diagnostics import MIRRORED, UNMIRROR, are_mirrored, dia
 from tracking.detection.tags import CORNER_SIGNS, alike_in_mirror, modules_across
 from tracking.edges.refine import RefinedTag, refine
 from tracking.measurement import TrackerSettings
-from tracking.pnp import BundlePose, TagView, solve_pnp
+from tracking.pnp import BundlePose, TagView, solve_pnp, square_poses
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -182,6 +183,95 @@ def _nothing_seen(
     )
 
 
+# Locatable tags: those that images connect to each other, whichever image is left out. What hangs
+# on one image alone has no jackknife, and an error of that image would go unnoticed.
+
+
+def connected_tags(pictures: Sequence[Iterable[int]], fixed: int | None = None) -> list[int]:
+    """The largest group of tags that stay connected without any one of the images.
+
+    Args:
+        pictures: Tag numbers in each image.
+        fixed: Select the group of this tag instead.
+
+    Returns:
+        Their numbers in order; empty when no two images show the same tag.
+    """
+    counts = Counter(frozenset(numbers) for numbers in pictures)
+    groups = _groups(counts)
+    for single in [numbers for numbers, count in counts.items() if count == 1]:
+        parts = _groups(counts.keys() - {single})
+        groups = [group & part for group in groups for part in parts if group & part]
+    if fixed is not None:
+        groups = [group for group in groups if fixed in group]
+    largest: set[int] = max(groups, key=lambda group: (len(group), -min(group)), default=set())
+    return sorted(largest)
+
+
+def _groups(pictures: Iterable[frozenset[int]]) -> list[set[int]]:
+    """Groups of tags that images connect."""
+    groups: list[set[int]] = []
+    for numbers in pictures:
+        tied = [group for group in groups if group & numbers]
+        groups = [group for group in groups if not group & numbers]
+        groups.append(set(numbers).union(*tied))
+    return groups
+
+
+# Layout from the images alone.
+
+
+_ORIGIN = Pose.level([0.0, 0.0, 0.0])
+_APART = 0.5
+"""Rotation [rad] plus shift [tag sizes] between two relative poses that do not agree."""
+
+
+def initial_layout(
+    camera: Camera, nominal: Mapping[int, Tag], observations: TagObservations
+) -> dict[int, Tag]:
+    """Tags at poses from the images alone, whatever the rig file states; sizes are its.
+
+    Each tag in an image has two candidate poses. Of two tags, the relative pose that most images
+    share is the right one. Tags that no images connect to each other have different frames.
+    """
+    relative: dict[tuple[int, int], list[list[Pose]]] = {}
+    for squares in observations.squares.values():
+        alone = {
+            number: square_poses(camera, TagView(replace(nominal[number], pose=_ORIGIN), square))
+            for number, square in squares.items()
+        }
+        for pair in combinations(sorted(number for number in alone if alone[number]), 2):
+            found = [a.inverse().compose(b) for a in alone[pair[0]] for b in alone[pair[1]]]
+            relative.setdefault(pair, []).append(found)
+    edges: dict[tuple[int, int], tuple[float, Pose]] = {}
+    for pair, candidates in relative.items():
+        size = sum(nominal[number].size for number in pair) / 2.0
+        shared, pose = _most_shared(candidates, size)
+        edges |= {pair: (shared, pose), pair[::-1]: (shared, pose.inverse())}
+    poses: dict[int, Pose] = {}
+    for first in observations.numbers:
+        poses.setdefault(first, _ORIGIN)
+        while links := [p for p in edges if p[0] in poses and p[1] not in poses]:
+            one, other = max(links, key=lambda pair: edges[pair][0])
+            poses[other] = poses[one].compose(edges[one, other][1])
+    return {number: replace(nominal[number], pose=pose) for number, pose in poses.items()}
+
+
+def _most_shared(candidates: Sequence[Sequence[Pose]], size: float) -> tuple[float, Pose]:
+    """How many images share a relative pose, and the one that most share."""
+    poses = [pose for one in candidates for pose in one]
+    turns = np.array([pose.rotation for pose in poses])
+    shifts = np.array([pose.position for pose in poses])
+    cosines = (np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0
+    gaps = np.arccos(np.clip(cosines, -1.0, 1.0))
+    gaps += np.linalg.norm(shifts[:, None] - shifts, axis=-1) / size
+    agreement = np.maximum(1.0 - gaps / _APART, 0.0)
+    first = np.cumsum([0, *(len(one) for one in candidates)])[:-1]
+    support = np.maximum.reduceat(agreement, first, axis=1).sum(axis=1)
+    best = int(np.argmax(support))
+    return float(support[best]), poses[best]
+
+
 # Bundle adjustment of all tags in all images: residuals, Jacobians, information.
 
 
@@ -203,7 +293,6 @@ class TagViews:
         tag: Tag index of each view, shape (v,).
         whitening: Shape (v, 8, 8), [1/px].
         target: Shape (v, 8).
-        flat: Corners of each view's tag in its own frame, shape (v, 4, 3), [m].
     """
 
     camera: Camera
@@ -211,7 +300,6 @@ class TagViews:
     tag: NDArray[np.int64]
     whitening: Array
     target: Array
-    flat: Array
 
     @classmethod
     def of(cls, camera: Camera, observations: TagObservations, tags: Sequence[Tag]) -> TagViews:
@@ -222,15 +310,12 @@ class TagViews:
             for k, squares in enumerate(observations.squares.values())
             for number, square in squares.items()
         ]
-        halves = np.array([tags[which].size / 2.0 for _, which, _ in found])
-        signs = np.column_stack([CORNER_SIGNS, np.zeros(4)])
         return cls(
             camera,
             np.array([k for k, _, _ in found], dtype=np.int64),
             np.array([which for _, which, _ in found], dtype=np.int64),
             np.array([square.whitening for _, _, square in found]),
             np.array([square.target for _, _, square in found]),
-            halves[:, None, None] * signs,
         )
 
     def errors(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> Array:
@@ -262,6 +347,18 @@ class TagViews:
         whole[view, row, (6 * self.picture[:, None] + six)[:, None, :]] = by_camera
         column = 6 * (len(cameras) + self.tag[:, None]) + six
         whole[view, row, column[:, None, :]] = by_tag
+        return whole.reshape(8 * len(self.tag), -1)
+
+    def size_slopes(self, cameras: Sequence[Pose], tags: Sequence[Tag]) -> Array:
+        """Jacobian of all errors by the logarithms of the tags' sizes, shape (8 v, t)."""
+        points, arms_camera, _ = self._points(cameras, tags)
+        turn = np.array([pose.rotation for pose in cameras])[self.picture]
+        middle = np.array([tag.pose.position for tag in tags])[self.tag]
+        arms = arms_camera - np.einsum("vij,vj->vi", turn, middle)[:, None]
+        by_size = np.einsum("vcij,vcj->vci", point_slopes(self.camera, points), arms)
+        whole = np.zeros((len(self.tag), 8, len(tags)))
+        view = np.arange(len(self.tag))
+        whole[view, :, self.tag] = np.einsum("vij,vj->vi", self.whitening, by_size.reshape(-1, 8))
         return whole.reshape(8 * len(self.tag), -1)
 
     def tag_information(
@@ -305,6 +402,8 @@ class TagViews:
         tag_position = np.array([tag.pose.position for tag in tags])[self.tag]
         turn = np.array([pose.rotation for pose in cameras])[self.picture]
         position = np.array([pose.position for pose in cameras])[self.picture]
-        arms_tag = np.einsum("vij,vcj->vci", tag_turn, self.flat)
+        halves = np.array([tag.size / 2.0 for tag in tags])[self.tag]
+        flat = halves[:, None, None] * np.column_stack([CORNER_SIGNS, np.zeros(4)])
+        arms_tag = np.einsum("vij,vcj->vci", tag_turn, flat)
         arms_camera = np.einsum("vij,vcj->vci", turn, arms_tag + tag_position[:, None])
         return arms_camera + position[:, None], arms_camera, arms_tag

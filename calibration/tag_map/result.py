@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import date
+from itertools import product
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -19,14 +21,20 @@ from calibration.results import (
     common_keys,
 )
 from calibration.statistics import Interval
-from calibration.tag_map.bundle_adjustment import TagLayout
+from calibration.tag_map.bundle_adjustment import (
+    FAILED_ERROR,
+    GOOD_ERROR,
+    SIZE_ERROR,
+    TagLayout,
+    align_to_nominal,
+)
 from model.errors import BadInput
 from model.files.camera_file import TagDocument
 from model.files.documents import AnyNonNegative, PoseDocument, Positive
 from model.files.rig_file import RigDocument
-from model.pose import Array, step_between
+from model.pose import Array, Pose, step_between
 from model.rig import Tag
-from tracking.detection.tags import tag_corners
+from tracking.detection.tags import mounted_rotated, tag_corners
 
 
 class TagsResult(ResultDocument):
@@ -43,8 +51,8 @@ class TagsResult(ResultDocument):
     seen: dict[str, int] = Field(description="number of images that show each tag")
 
     def in_words(self) -> list[tuple[str, str]]:
-        """As for every result; rotations are relative to the stated one: uncertainty only."""
-        return pose_rows(self.stated)
+        """As for every result, unless the fit has failed; rotations: uncertainty only."""
+        return [] if self.rms_px > FAILED_ERROR else pose_rows(self.stated)
 
     def changes_to(self, other: Self) -> dict[str, float]:
         """Shifts and rotations of the other result's tags, along the platform's axes."""
@@ -171,11 +179,16 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdi
     gauge = "The platform frame is the best fit of all tags to the rig file."
     if result.fixed is not None:
         gauge = f"Tag {result.fixed} is kept as in the rig file."
-    return page_of(
-        f"Tags on the platform of {document.name}",
-        f"{document.date}, {len(result.errors)} images used",
-        verdict,
-        [
+    quality = [
+        ("reprojection error, RMS", f"{result.reprojection:.3f} px"),
+        ("tags located", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
+        ("size relative to the rig file", f"{result.scale:.5f}"),
+        ("data", document.data_sha256[:23]),
+    ]
+    if result.has_failed:
+        sections = [Section("Quality", table_of([quality[0], quality[-1]]))]
+    else:
+        sections = [
             Section(
                 "Tags against the rig file",
                 table_of(
@@ -189,17 +202,14 @@ def tags_page(result: TagLayout, document: TagsResult, verdict: CalibrationVerdi
                 table_of(_pose_rows(document), ("tag", *AXES)),
                 "Rotations are about the platform's axes, relative to the stated one.",
             ),
-            Section(
-                "Quality",
-                table_of(
-                    [
-                        ("reprojection error, RMS", f"{result.reprojection:.3f} px"),
-                        ("tags located", f"within {verdict.error * 1e3:.2g} mm (95 %)"),
-                        ("size relative to the rig file", f"{result.scale:.5f}"),
-                        ("data", document.data_sha256[:23]),
-                    ]
-                ),
-            ),
+            Section("Quality", table_of(quality)),
+        ]
+    return page_of(
+        f"Tags on the platform of {document.name}",
+        f"{document.date}, {len(result.errors)} images used",
+        verdict,
+        [
+            *sections,
             Section(
                 "Images used",
                 table_of((name, f"{error:.3f} px") for name, error in result.errors.items()),
@@ -229,6 +239,8 @@ def change_rows(result: TagLayout) -> list[tuple[str, str, str, str, str]]:
 def layout_facts(found: TagLayout) -> list[tuple[str, str]]:
     """Human-readable details beside the estimates."""
     used = f"{len(found.errors)} used, reprojection error {found.reprojection:.3f} px RMS"
+    if found.has_failed:
+        return [("images", used)]
     moved = [
         (name, f"moved {shift} mm, rotated {turn}° from the rig file; {count}")
         for name, shift, turn, _, count in change_rows(found)
@@ -247,11 +259,9 @@ def _pose_rows(document: TagsResult) -> list[tuple[str, ...]]:
 # Verdict.
 
 
-GOOD_IMAGES, GOOD_VIEWS, GOOD_ERROR = 12, 4, 0.3
-"""Required images in all, images of each tag, and reprojection error [px]."""
+GOOD_IMAGES, GOOD_VIEWS = 12, 4
+"""Required images in all, and of each tag."""
 GOOD_SIDES_DEG = 40.0
-GOOD_SCALE = 0.02
-"""Allowed relative deviation of the layout's size from the rig file."""
 FAR_MM, FAR_DEG = 10.0, 8.0
 """A tag farther off than this was mounted elsewhere, or this is another platform."""
 
@@ -263,12 +273,21 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
         result: The measured layout.
         wanted: Required error of tag corners, [m].
     """
-    issues = [*_image_issues(result), *_tag_issues(result)]
     error = result.error
-    if not error <= wanted:
-        what = f"tags are located within {beyond(error, wanted)}"
-        issues.append(Issue(what, "take more images, closer, sharp and from all sides"))
+    if cause := _wrong_rig_file(result):
+        issues = [cause]
+    else:
+        issues = [*_image_issues(result), *_fit_issues(result)]
+        if not result.has_failed:
+            issues += _layout_issues(result)
+            if not error <= wanted:
+                issues.append(_too_inaccurate(error, wanted))
     return CalibrationVerdict.of(error, wanted, "in the tags' positions", issues)
+
+
+def _too_inaccurate(error: float, wanted: float) -> Issue:
+    what = f"tags are located within {beyond(error, wanted)}"
+    return Issue(what, "take more images, closer, sharp and from all sides")
 
 
 def _image_issues(result: TagLayout) -> list[Issue]:
@@ -276,27 +295,6 @@ def _image_issues(result: TagLayout) -> list[Issue]:
     if len(result.errors) < GOOD_IMAGES:
         what = f"{len(result.errors)} images show two tags or more; {GOOD_IMAGES} are required"
         issues.append(Issue(what, "take 20 images from all sides, two or three tags in each"))
-    if np.degrees(result.sides) < GOOD_SIDES_DEG:
-        what = (
-            f"all images are taken from within {np.degrees(result.sides):.0f}°;"
-            f" {GOOD_SIDES_DEG:.0f}° is required"
-        )
-        issues.append(Issue(what, "take images from all sides, all different"))
-    if result.reprojection > GOOD_ERROR:
-        what = f"the reprojection error is {result.reprojection:.2f} px"
-        step = (
-            "check sizes and numbers of the tags, that they lie flat, and the camera's parameters"
-        )
-        issues.append(Issue(what, step))
-    if abs(result.scale - 1.0) > GOOD_SCALE:
-        direction = "larger" if result.scale > 1.0 else "smaller"
-        what = f"the layout is {abs(result.scale - 1.0):.1%} {direction} than in the rig file"
-        issues.append(Issue(what, "measure the black squares and correct size_mm in the rig file"))
-    return issues
-
-
-def _tag_issues(result: TagLayout) -> list[Issue]:
-    issues = []
     for number, why in result.unseen.items():
         step = f"take images that show tag {number} together with others"
         issues.append(Issue(f"tag {number} {why}", step))
@@ -304,10 +302,109 @@ def _tag_issues(result: TagLayout) -> list[Issue]:
         if count < GOOD_VIEWS:
             what = f"tag {number} is in {count} images; {GOOD_VIEWS} are required"
             issues.append(Issue(what, f"take more images of tag {number} with its neighbours"))
-    for tag, nominal in zip(result.tags, result.nominal, strict=True):
-        shift, turn = nominal.pose.distance_to(tag.pose) * 1e3, nominal.pose.angle_to(tag.pose)
-        if shift > FAR_MM or np.degrees(turn) > FAR_DEG:
+    return issues
+
+
+def _fit_issues(result: TagLayout) -> list[Issue]:
+    """That the tags do not fit the images, and the sizes that would."""
+    if result.reprojection <= GOOD_ERROR:
+        return []
+    what = f"the reprojection error is {result.reprojection:.2f} px"
+    sizes = {
+        tag.id: f"tag {tag.id} is {tag.size * 1e3:.1f} mm wide, not {own.size * 1e3:g} mm"
+        for tag, own in zip(result.resized or (), result.nominal, strict=False)
+        if abs(tag.size / own.size - 1.0) > SIZE_ERROR
+    }
+    if not sizes:
+        step = (
+            "check sizes and numbers of the tags, that they lie flat, and the camera's parameters"
+        )
+        return [Issue(what, step)]
+    which = ", ".join(map(str, sizes))
+    step = f"measure the black square of tag {which} and correct size_mm in the rig file"
+    return [Issue(f"{what}; the images fit if {' and '.join(sizes.values())}", step)]
+
+
+def _layout_issues(result: TagLayout) -> list[Issue]:
+    issues = []
+    if np.degrees(result.sides) < GOOD_SIDES_DEG:
+        what = (
+            f"all images are taken from within {np.degrees(result.sides):.0f}°;"
+            f" {GOOD_SIDES_DEG:.0f}° is required"
+        )
+        issues.append(Issue(what, "take images from all sides, all different"))
+    if abs(result.scale - 1.0) > SIZE_ERROR:
+        direction = "larger" if result.scale > 1.0 else "smaller"
+        what = f"the layout is {abs(result.scale - 1.0):.1%} {direction} than in the rig file"
+        issues.append(Issue(what, "measure the black squares and correct size_mm in the rig file"))
+        scaled = [_scaled(tag, result.scale) for tag in result.nominal]
+        if _fits(result.tags, scaled):
+            return issues
+    for tag, own in zip(result.tags, result.nominal, strict=True):
+        if _is_far(own, tag):
+            shift, turn = own.pose.distance_to(tag.pose) * 1e3, own.pose.angle_to(tag.pose)
             what = f"tag {tag.id} is {shift:.1f} mm and {np.degrees(turn):.1f}° from the rig file"
             step = f"check the position and rotation of tag {tag.id} in the rig file"
             issues.append(Issue(what, step))
     return issues
+
+
+# What is wrong in the rig file, if its tags fit once that is corrected.
+
+
+def _is_far(nominal: Tag, tag: Tag) -> bool:
+    shift, turn = nominal.pose.distance_to(tag.pose), nominal.pose.angle_to(tag.pose)
+    return shift * 1e3 > FAR_MM or np.degrees(turn) > FAR_DEG
+
+
+def _wrong_rig_file(result: TagLayout) -> Issue | None:
+    """The one mistake in the rig file that explains why tags are far from it; else None."""
+    tags = result.resized or result.tags
+    if (result.has_failed and not result.resized) or _fits(tags, result.nominal):
+        return None
+    rotated = mounted_rotated(result.nominal, result.family, lambda other: _fits(tags, other))
+    if rotated is not None:
+        return Issue(*rotated)
+    if _fits(tags, [_read_as_xyzw(tag) for tag in result.nominal]):
+        what = "all tags fit if the numbers of rotation_wxyz are read as x, y, z, w"
+        return Issue(what, "write w first in the rotation_wxyz of tags.platform in the rig file")
+    return _exchanged(tags, result.nominal)
+
+
+def _fits(tags: Sequence[Tag], nominal: Sequence[Tag]) -> bool:
+    """Whether no tag is far from its nominal pose, both in the best common frame."""
+    shift, _ = align_to_nominal(tags, nominal, None)
+    aligned = (replace(tag, pose=shift.compose(tag.pose)) for tag in tags)
+    return not any(_is_far(own, tag) for own, tag in zip(nominal, aligned, strict=True))
+
+
+def _scaled(tag: Tag, factor: float) -> Tag:
+    return replace(tag, pose=Pose(factor * tag.pose.position, tag.pose.rotation))
+
+
+def _read_as_xyzw(tag: Tag) -> Tag:
+    pose = Pose.from_quaternion(tag.pose.position, np.roll(tag.pose.quaternion, 1))
+    return replace(tag, pose=pose)
+
+
+def _exchanged(tags: Sequence[Tag], nominal: Sequence[Tag]) -> Issue | None:
+    """That tags are at the poses of others, if all fit so; the order with fewest changes."""
+    here, there = (np.array([tag.pose.position for tag in which]) for which in (tags, nominal))
+    found = []
+    for tag, other in product(tags, nominal):
+        shift = other.pose.compose(tag.pose.inverse())
+        gaps = np.linalg.norm(shift.apply(here)[:, None] - there, axis=-1)
+        order = np.argmin(gaps, axis=1).tolist()
+        others = [nominal[k] for k in order]
+        if len(set(order)) == len(order) and _fits(tags, others):
+            pairs = zip(tags, others, strict=True)
+            found.append([(own, one) for own, one in pairs if own.id != one.id])
+    if not found:
+        return None
+    moved = min(found, key=len)
+    where = " and ".join(f"tag {own.id} is at the pose of tag {one.id}" for own, one in moved)
+    is_sized = all(abs(own.size / one.size - 1.0) < SIZE_ERROR for own, one in moved)
+    which = "ids" if is_sized else "position_mm and rotation_wxyz"
+    numbers = " and ".join(str(own.id) for own, _ in moved)
+    step = f"exchange the {which} of tags {numbers} in the rig file, or the prints"
+    return Issue(f"all tags fit if {where}", step)

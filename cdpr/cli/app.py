@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gc
 import inspect
 import io
@@ -337,6 +338,9 @@ def _from_os_error(error: OSError) -> CdprError:
         return BadInput(
             "the path cannot be used", where=shown(str(error.filename)), why=why, next_step=hint
         )
+    if error.errno in (errno.EMFILE, errno.ENFILE):
+        hint = "allow more open files, for instance `ulimit -n 1024`"
+        return Fault("the system allows no more open files", why=why, next_step=hint)
     hint = "check the output's destination and its free space"
     return Fault("the command could not write all its output", why=why, next_step=hint)
 

@@ -10,9 +10,11 @@ from rich.markup import escape
 from cdpr.cli.arguments import argument, option
 from cdpr.cli.options import JSON
 from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
+from drivers.stopping_distance import stopping_remarks
 from executor.recording.verdict import fault_titles, page_of_fault
 from model.plan import load_plan, require_same_rig
 from model.rig import load_rig
+from model.scene import legs_of
 from planner.check import check_path
 
 
@@ -37,6 +39,10 @@ def check(
     terminal.remarks(the_plan.scene.remarks(the_rig))
     with terminal.waiting("checking"):
         report = check_path(the_rig, the_plan.scene, the_plan.waypoints, the_plan.stops)
+    if report.passed:
+        loads = [leg.scene.load for leg in legs_of(the_plan.scene)]
+        room = report.proved_obstacle_clearance, report.proved_capacity_margin
+        terminal.remarks(stopping_remarks(the_rig, loads, the_plan.waypoints, *room))
     if as_json:
         show_json({"plan": str(plan), "hash": the_plan.document.hash, **report.as_dict()})
     else:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from itertools import chain, count, pairwise
+from itertools import chain, count
 from pathlib import Path
 from types import TracebackType
 
@@ -167,7 +167,8 @@ def image_files(folder: Path) -> tuple[Path, ...]:
             where=str(folder),
             next_step=f"name a folder with files ending in {', '.join(IMAGE_ENDINGS)}",
         )
-    return tuple(sorted(found, key=lambda path: natural_order(image_name(path))))
+    order = natural_order(map(image_name, found))
+    return tuple(sorted(found, key=lambda path: order(image_name(path))))
 
 
 def image_name(path: Path) -> str:
@@ -288,37 +289,36 @@ def _first(unused: Mapping[str, str]) -> str:
     return "; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
 
 
-def natural_order(name: str) -> tuple[list[tuple[int, int, str]], str]:
-    """Sort key that puts ``frame_10`` after ``frame_9``; different for different names."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
+#: Decimals at the end of a file's name, before its suffix.
+_DECIMALS = re.compile(r"(?<=\d\.)\d+(?=\.[^.]*$)")
 
 
-#: HHMMSS or HHMMSSmmm, perhaps after a date.
-_TIME_OF_DAY = re.compile(r"(?:\d{8})?([01]\d|2[0-3])([0-5]\d)([0-5]\d)(\d{3})?")
+def natural_order(names: Iterable[str]) -> Callable[[str], tuple[list[tuple[int, int, str]], str]]:
+    """Sort key of a folder's names, different for each: ``frame_10`` comes after ``frame_9``.
 
-
-def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
-    """The first names between which images seem to be missing, by the last number of each.
-
-    The numbers increase, and most by about the same step, which is 1, 10 or that of time stamps.
-    Those that can all be times of day are taken as such.
-
-    Args:
-        names: In natural order.
+    If names end in numbers of seconds, such as ``1763000000.667`` and ``1763000000.8``, they are
+    in order of time.
     """
-    found = [re.findall(r"\d+", Path(name).stem) for name in names]
-    if len(found) < 3 or not all(found):
-        return None
-    times = [_TIME_OF_DAY.fullmatch(numbers[-1]) for numbers in found]
-    parts = [[int(part or 0) for part in time.groups()] for time in times if time is not None]
-    counts = [int(numbers[-1]) for numbers in found]
-    if len(parts) == len(found):
-        counts = [((h * 60 + m) * 60 + s) * 1000 + ms for h, m, s, ms in parts]
-    steps = [after - before for before, after in pairwise(counts)]
-    usual = sorted(steps)[(len(steps) - 1) // 2]
-    gaps = (k for k, step in enumerate(steps) if step > 1.5 * usual and min(steps) > 0)
-    return next(((names[k], names[k + 1]) for k in gaps), None)
+    digits = _most_decimals(names)
+
+    def key(name: str) -> tuple[list[tuple[int, int, str]], str]:
+        padded = _DECIMALS.sub(lambda decimals: decimals[0].ljust(digits, "0"), name.lower())
+        parts = re.split(r"(\d+)", padded)
+        return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
+
+    return key
+
+
+def _most_decimals(names: Iterable[str]) -> int:
+    """The most decimals of numbers written without trailing zeros, as Python does; 0 for others.
+
+    Where dots separate counts, as in ``2.9`` and ``2.10``, some end in zero unless there are few,
+    and none begins with zero unless all have the same length.
+    """
+    decimals = [found[0] for name in names if (found := _DECIMALS.search(name))]
+    are_cut = not any(len(digits) > 1 and digits.endswith("0") for digits in decimals)
+    are_fine = any(re.match(r"0\d|\d{3}", digits) for digits in decimals)
+    return max(map(len, decimals)) if are_cut and are_fine else 0
 
 
 # Images written to a folder or into a video.

@@ -193,12 +193,38 @@ class DriverTimes:
         return now - (age - self._ages[0][1])
 
 
+class CopyCheck:
+    """Recognizes images that are copies of the one before, to the bit.
+
+    These are not new ones: noise makes images of a camera differ, but a decoder or driver that
+    hangs may repeat its last one, and a recorder or converter the one before a lost one.
+
+    Attributes:
+        count: Number of copies so far.
+    """
+
+    def __init__(self) -> None:
+        """Starts without images."""
+        self.count = 0
+        self._last: NDArray[np.generic] | None = None
+
+    def is_copy(self, picture: NDArray[np.generic]) -> bool:
+        """Takes the next image; a few of its rows suffice for most that are not copies."""
+        last, self._last = self._last, picture
+        is_copy = (
+            last is not None
+            and np.array_equal(picture[::64], last[::64])
+            and np.array_equal(picture, last)
+        )
+        self.count += is_copy
+        return is_copy
+
+
 class FrameReader:
     """Opens a camera and reads all its images in a thread.
 
-    Images that waited in a queue are skipped, unless the driver states their times. A copy of the
-    image before is not a new one: noise makes images of a camera differ, but a decoder or driver
-    that hangs may repeat its last one.
+    Images that waited in a queue are skipped, unless the driver states their times, and so are
+    copies.
 
     Attributes:
         lost: Why the camera delivers no more, as a predicate of it.
@@ -264,8 +290,7 @@ class FrameReader:
     def _read_all(self, capture: cv2.VideoCapture) -> None:
         """Puts each image of a camera until that is lost, or this closed."""
         number = failed = 0
-        last: Arrived | None = None
-        schedule, driver_times = ArrivalSchedule(), DriverTimes()
+        copies, schedule, driver_times = CopyCheck(), ArrivalSchedule(), DriverTimes()
         latest, is_used = self._clock() + FROZEN, False
         self.lost = "" if capture.isOpened() else NOT_OPENED
         while not (self.lost or self._is_closing):
@@ -280,8 +305,7 @@ class FrameReader:
             is_on_time = schedule.is_on_time(now) or time is not None or not self._needs_times
             arrived = Arrived(number, now if time is None else time, np.asarray(picture))
             number += 1
-            is_copy = last is not None and _is_copy(arrived.picture, last.picture)
-            last = last if is_copy else arrived
+            is_copy = copies.is_copy(arrived.picture)
             self.late += is_used and not is_on_time
             if is_on_time and not (is_copy and is_used):
                 is_used, latest = True, now + FROZEN
@@ -305,8 +329,3 @@ def _stated_time(capture: cv2.VideoCapture) -> float:
     if capture.getBackendName() != "V4L2":
         return 0.0
     return capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3
-
-
-def _is_copy(picture: NDArray[np.generic], last: NDArray[np.generic]) -> bool:
-    """Whether two images are equal; a few of their rows suffice for most that are not."""
-    return np.array_equal(picture[::64], last[::64]) and np.array_equal(picture, last)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from model.errors import BadInput, require_not_empty, sequence_of
 from model.files.reading import docs_page, is_folder
+from model.progress import Listener
 from model.rig import Camera, Rig
 
 SYNTHETIC = "synthetic"
@@ -292,7 +295,7 @@ def require_synthetic_images(sources: Iterable[str], fast: bool) -> None:
         )
 
 
-# Which images are requested, and which of several cameras are simultaneous.
+# Which images are requested, which of several cameras are simultaneous, and which are missing.
 
 
 def cycles_per_image(rate: float, cycle: float) -> int:
@@ -346,3 +349,94 @@ def _kind(source: str) -> str:
     if Path(source).is_file():
         return "a video"
     return "synthetic" if source == SYNTHETIC else "live"
+
+
+def report_different_videos(videos: Mapping[str, tuple[int, float]], listener: Listener) -> None:
+    """Remarks on videos of different length or rate: they may not have begun together.
+
+    Args:
+        videos: Number of images, and rate [Hz], of that of each camera.
+        listener: Receives the remark.
+    """
+    if len({(count, round(rate, 3)) for count, rate in videos.values()}) > 1:
+        facts = ", ".join(f"{n} {count} at {rate:.6g}/s" for n, (count, rate) in videos.items())
+        listener.remark(
+            f"the videos have different numbers of images or rates ({facts}); images are paired by"
+            " their times from the beginning of each, which must be simultaneous"
+        )
+
+
+#: HHMMSS, HHMMSSmmm or HH-MM-SS at the end, perhaps after a date.
+_TIME_OF_DAY = re.compile(r"(?<!\d)(?:\d{8})?([01]\d|2[0-3])(\D?)([0-5]\d)\2([0-5]\d)(\d{3})?$")
+#: Two numbers at the end: perhaps seconds and a fraction of them.
+_TWO_NUMBERS = re.compile(r"(.*?(\d+))(\D)(\d+)")
+#: A fraction of seconds has at least so many digits; with fewer than `_FINE` it may be a number of
+#: images, which rarely exceeds half of those that its digits can count.
+_COARSE, _FINE = 3, 6
+#: Seconds have at least so many digits unless a decimal point follows: others number recordings.
+_SECONDS_SINCE_1970 = 9
+
+
+def report_gap(names: Sequence[str], listener: Listener) -> None:
+    """Remarks on images that seem to be missing, by the names of the others in natural order."""
+    if gap := first_gap(names):
+        listener.remark(
+            f"images seem to be missing between {' and '.join(gap)}: times are those of consecutive"
+            " images, so later ones are too early, and the next poses of a camera with readout_ms"
+            " are wrong"
+        )
+
+
+def first_gap(names: Sequence[str]) -> tuple[str, str] | None:
+    """The first names between which images seem to be missing, by the last number of each.
+
+    The numbers increase, and most by about the same step, which is 1, 10 or that of time stamps.
+    Those that can all be times of day are taken as such; those that do not increase, as fractions
+    of the seconds before them.
+
+    Args:
+        names: In natural order.
+    """
+    stems = [Path(name).stem for name in names]
+    last = [number for stem in stems for number in re.findall(r"\d+", stem)[-1:]]
+    if len(last) < 3 or len(last) < len(stems):
+        return None
+    times = _times_of_day(stems)
+    for counts in [times] if times else [list(map(int, last)), _times_with_fraction(stems)]:
+        steps = [after - before for before, after in pairwise(counts)]
+        if min(steps, default=0) > 0:
+            usual = sorted(steps)[(len(steps) - 1) // 2]
+            gaps = (k for k, step in enumerate(steps) if step > 1.5 * usual)
+            return next(((names[k], names[k + 1]) for k in gaps), None)
+    return None
+
+
+def _times_of_day(stems: Iterable[str]) -> list[int]:
+    """Those at the ends of all names, [ms]; empty if a name has none."""
+    found = [_TIME_OF_DAY.search(stem) for stem in stems]
+    parts = [time.group(1, 3, 4, 5) for time in found if time is not None]
+    numbers = [[int(part or 0) for part in time] for time in parts]
+    times = [((h * 60 + m) * 60 + s) * 1000 + ms for h, m, s, ms in numbers]
+    return times if len(times) == len(found) else []
+
+
+def _times_with_fraction(stems: Iterable[str]) -> list[int]:
+    """Times of names that end in seconds and a fraction of them, in units of its last digit.
+
+    The seconds are those of a time of day, or since 1970, or any number before a decimal point.
+    Empty for other names.
+    """
+    found = [_TWO_NUMBERS.fullmatch(stem) for stem in stems]
+    named = [two.groups() for two in found if two is not None]
+    fractions = [fraction for *_, fraction in named]
+    digits = max(map(len, fractions), default=0)
+    are_decimals = all(sign == "." for _, _, sign, _ in named)
+    are_even = are_decimals or min(map(len, fractions), default=0) == digits
+    are_fractions = digits >= _FINE or (digits >= _COARSE and max(fractions) >= "5")
+    if len(named) < len(found) or not (are_even and are_fractions):
+        return []
+    seconds = [time // 1000 for time in _times_of_day(whole for whole, *_ in named)]
+    if not seconds and (are_decimals or all(len(n) >= _SECONDS_SINCE_1970 for _, n, *_ in named)):
+        seconds = [int(number) for _, number, *_ in named]
+    fine = [int(fraction.ljust(digits, "0")) for fraction in fractions]
+    return [s * 10**digits + part for s, part in zip(seconds, fine, strict=False)]

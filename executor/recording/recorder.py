@@ -200,12 +200,17 @@ def between(values: Array, index: ArrayLike) -> Array:
 EVERY = 0.4
 #: Largest delay of the disk, [s]: SD cards hang for a second or two.
 BEHIND = 5.0
+#: A longer time between two cycles, [s], is one in which the program was suspended.
+_SUSPENDED = 2.0
 #: Largest number of queued writes: the cycles of `BEHIND` seconds, and many events.
 _MOST_WAITING = 512
 
 
 class _Mark(NamedTuple):
-    """How far the cycles are queued or written; replaced whole, as two threads read it."""
+    """How far the cycles are queued or written, and when [s], suspensions not counted.
+
+    Replaced whole, as two threads read it.
+    """
 
     end: int
     at: float
@@ -223,6 +228,7 @@ class RecordWriter:
     def __init__(self, folder: RunFolder, log: RunLog, *, own_thread: bool) -> None:
         self._folder, self._log, self._own_thread = folder, log, own_thread
         self._queued = self._written = _Mark(0, 0.0)
+        self._latest, self._suspended = 0.0, 0.0
         self._trouble: CdprError | None = None
         self._waiting: queue.SimpleQueue[Callable[[], object] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -244,10 +250,14 @@ class RecordWriter:
         Raises:
             CdprError: The record cannot be written, or the disk is far behind.
         """
+        gap, self._latest = at - self._latest, at
         if not self._queued.end:
             self._queued = self._written = _Mark(0, at)
-        if at - self._queued.at >= EVERY or not self._queued.end:
-            self._queue_cycles(at)
+        elif gap > _SUSPENDED:
+            self._suspended += gap
+        counted = at - self._suspended
+        if gap > EVERY or counted - self._queued.at >= EVERY or not self._queued.end:
+            self._queue_cycles(counted)
 
     def take_event(self, event: RunEvent) -> None:
         """Queues an event.

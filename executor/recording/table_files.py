@@ -99,6 +99,14 @@ class Columns:
             found[:, *at] = found[:, *at[::-1]] = column if self.kind is int else column / by
         return found
 
+    def rounded(self, values: Any) -> Any:
+        """An attribute's numbers as read from a file to which they were written."""
+        found: Any = np.empty_like(values)
+        for _, at, by in self._entries():
+            column = np.array([float(self.form % x) for x in (values[:, *at] * by).tolist()])
+            found[:, *at] = found[:, *at[::-1]] = column / by
+        return found
+
     def _entries(self) -> Iterator[tuple[str, tuple[int, ...], Any]]:
         """Name of each column, its index into a row of the attribute, and its scale."""
         scales = np.broadcast_to(self.scale, self.shape)
@@ -156,6 +164,15 @@ class Table:
         """A table without rows."""
         names = chain(*(columns.numbered(cables).names for columns in cls.layout().values()))
         return cls.of_file(TableFile(Path(), ",".join(names)))
+
+    def as_read(self, *names: str) -> Self:
+        """The table with these attributes, of numbers, as read from its file.
+
+        So what is computed from them is the same before and after they are written.
+        """
+        layout = self.layout()
+        read = {name: layout[name].rounded(getattr(self, name)) for name in names}
+        return replace(self, **read)  # type: ignore[type-var]
 
     def columns(self) -> list[Column]:
         """All columns of the file; those of each cable are last, side by side."""

@@ -264,7 +264,12 @@ class FusedTable(Table):
 
 
 def fused_table(cycles: CycleTable, poses: PoseTable) -> FusedTable:
-    """The encoder poses of a run, corrected by its images between two of them."""
+    """The encoder poses of a run, corrected by its images between two of them.
+
+    Both tables as read from their files: a new report makes the same ``fused.csv``.
+    """
+    cycles = cycles.as_read("time", "encoder", "encoder_rotation")
+    poses = poses.as_read("time", "position", "rotation", "covariance")
     known, after = cycles.has_encoder_pose, np.searchsorted(cycles.time, poses.time)
     padded = np.pad(known, 1, mode="edge") if len(known) else np.zeros(2, dtype=bool)
     between = padded[after] & padded[after + 1]

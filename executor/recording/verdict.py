@@ -307,10 +307,11 @@ def _against_required(rows: ClearanceTable, required: float, source_name: str) -
     if not passed:  # rounded down, so that they do not look like the required one
         low, distance, high = (math.floor(round(x * 10.0, 6)) / 10.0 for x in (low, distance, high))
     bounds = f"{INTERVAL} {low:.1f} to {high:.1f} mm"
+    time = round(float(rows.time[worst]), 1) + 0.0  # not -0.0
     subject = "Smallest clearance" if passed else "Clearance"  # a less certain one may be smaller
     text = (
         f"{subject} measured by {source_name}: {distance:.1f} mm, {bounds}"
-        f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {rows.time[worst]:.1f} s);"
+        f" ({rows.body[worst]} to {rows.obstacle[worst]}, at {time:.1f} s);"
         f" required {required * 1e3:g} mm."
     )
     return Check(f"clearance_{rows.source[worst]}", passed, text)

@@ -345,7 +345,7 @@ def frames(run: RunData) -> str:
 
 def _figure(run: RunData, row: int) -> str:
     poses = run.poses
-    time = f"{float(poses.time[row]):.1f} s"
+    time = f"{round(float(poses.time[row]), 1) + 0.0:.1f} s"  # not -0.0
     data = base64.b64encode(_smaller(run.folder.image(poses.picture[row]))).decode()
     return (
         f'<figure><img src="data:image/jpeg;base64,{data}" alt="Camera image after {time}">'

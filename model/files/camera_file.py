@@ -40,6 +40,8 @@ ArucoDictionary = Literal[
 TagFamily = Literal[AprilTagFamily, ArucoDictionary]
 
 APRILTAG_FAMILIES: tuple[str, ...] = get_args(AprilTagFamily)
+#: Other families of the AprilTag project, by how their names begin.
+_BITS_OUTSIDE = ("tagStandard", "tagCircle", "tagCustom")
 #: All families.
 FAMILIES: tuple[str, ...] = APRILTAG_FAMILIES + get_args(ArucoDictionary)
 
@@ -165,6 +167,16 @@ class TagsDocument(Document):
         default=None,
         description="position error of the platform's tag corners, 95 %; calibrations write it",
     )
+
+    @field_validator("family", mode="before")
+    @classmethod
+    def _bits_inside(cls, family: object) -> object:
+        if isinstance(family, str) and family.startswith(_BITS_OUTSIDE):
+            raise ValueError(
+                f"{family[:60]} has data bits outside its border, which is not supported: state"
+                " tag36h11, and print the tags with `cdpr calibrate print PDF --rig RIG`"
+            )
+        return family
 
     def ids(self) -> list[tuple[tuple[str | int, ...], int]]:
         """Number of every tag, with its key in the rig file."""

@@ -7,11 +7,12 @@ the file from the answers.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from model.errors import BadInput
@@ -234,6 +235,12 @@ def coordinate_questions(ends: str, answers: Answers) -> list[RigQuestion]:
     ]
 
 
+def _box_of(anchors_mm: Sequence[Sequence[float]]) -> list[float]:
+    """Edges of the box that the anchors span, none very thin."""
+    edges = np.ptp(np.array(anchors_mm, dtype=np.float64), axis=0)
+    return [math.ceil(10.0 * max(edge, 0.1 * max(edges))) / 10.0 for edge in edges.tolist()]
+
+
 def _geometry_problems(answers: Answers) -> list[str]:
     """What is wrong with platform, outlets and anchors, as far as they are answered."""
     known: dict[str, Any] = {
@@ -352,6 +359,8 @@ def collect_answers(
         BadInput: A given answer is invalid.
     """
     answers: dict[str, Any] = {"name": name}
+    if "anchors_mm" in given:  # the default
+        answers["platform_mm"] = _box_of(given["anchors_mm"])
 
     def answer(question: RigQuestion, given: Answers = given) -> Any:
         if question.key in given:

@@ -809,6 +809,21 @@ def test_figures_show_cables_obstacles_and_path(
     plt.close("all")
 
 
+def test_no_label_of_a_figure_is_cut_however_wide_and_low_the_robot_is() -> None:
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    wide = cdpr.load_rig(Path(__file__).parents[2] / "configs/hall_10_6.yaml")
+    for scale in (1.0, 3.0):
+        outlets = [[scale * x, scale * y, z] for x, y, z in wide.document.outlets_mm]
+        document = wide.document.model_copy(update={"outlets_mm": outlets})
+        figure = rig_from_document(document).plot()
+        figure.canvas.draw()
+        label = figure.axes[0].zaxis.label.get_window_extent()  # type: ignore[attr-defined]
+        assert label.x1 <= figure.bbox.x1
+    plt.close("all")
+
+
 def test_faces_of_a_cylinder_are_drawn_with_one_number_of_corners(
     rig: cdpr.Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:

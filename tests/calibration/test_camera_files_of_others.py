@@ -75,6 +75,65 @@ JSON = """{
         "data": [-0.28, 0.07, 0.0002, 0.00002, 0.5]}
 }
 """
+INTERACTIVE_XML = """<?xml version="1.0"?>
+<opencv_storage>
+<calibrationDate>"Thu 07 Apr 2016 04:23:03 PM MSK"</calibrationDate>
+<framesCount>21</framesCount>
+<cameraResolution>
+  752 480</cameraResolution>
+<cameraMatrix type_id="opencv-matrix">
+  <rows>3</rows>
+  <cols>3</cols>
+  <dt>d</dt>
+  <data>
+    4.615e+02 0. 3.625e+02 0. 4.6025e+02 2.46e+02 0. 0. 1.</data></cameraMatrix>
+<cameraMatrix_std_dev type_id="opencv-matrix">
+  <rows>4</rows>
+  <cols>1</cols>
+  <dt>d</dt>
+  <data>
+    0. 1.29e+01 2.85e+00 2.83e+00</data></cameraMatrix_std_dev>
+<dist_coeffs type_id="opencv-matrix">
+  <rows>1</rows>
+  <cols>5</cols>
+  <dt>d</dt>
+  <data>
+    -0.28 0.07 0.0002 2e-05 0.5</data></dist_coeffs>
+<dist_coeffs_std_dev type_id="opencv-matrix">
+  <rows>5</rows>
+  <cols>1</cols>
+  <dt>d</dt>
+  <data>
+    1.6e-02 8.7e-02 0. 0. 1.8e-01</data></dist_coeffs_std_dev>
+<avg_reprojection_error>4.2691743074130178e-01</avg_reprojection_error>
+</opencv_storage>
+"""
+MATRIX_DATA = (
+    "rows: 3\n   cols: 3\n   dt: d\n   data: [ 461.5, 0., 362.5, 0., 460.25, 246., 0., 0., 1. ]"
+)
+LENS_DATA = "rows: 1\n   cols: 5\n   dt: d\n   data: [ -0.28, 0.07, 0.0002, 2e-05, 0.5 ]"
+INTERACTIVE = f"""%YAML:1.0
+---
+calibrationDate: "Thu 07 Apr 2016 04:23:03 PM MSK"
+framesCount: 21
+cameraResolution: [ 752, 480 ]
+cameraMatrix: !!opencv-matrix
+   {MATRIX_DATA}
+dist_coeffs: !!opencv-matrix
+   {LENS_DATA}
+avg_reprojection_error: 4.2691743074130178e-01
+"""
+STEREO = f"""%YAML:1.0
+---
+M1: !!opencv-matrix
+   {MATRIX_DATA.replace("461.5", "455.5")}
+D1: !!opencv-matrix
+   {LENS_DATA.replace("0.07", "0.08")}
+M2: !!opencv-matrix
+   {MATRIX_DATA}
+D2: !!opencv-matrix
+   {LENS_DATA}
+"""
 EUROC = """sensor_type: camera
 T_BS: {cols: 4, rows: 4, data: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
 rate_hz: 20
@@ -122,6 +181,8 @@ FOREIGN = {
     "plumb_bob": ("%YAML:1.0\n---\n" + CAMERA.replace("MODEL", "plumb_bob"), "pinhole", FOUR),
     "without a first line": (CAMERA.replace("MODEL", "equidistant"), "fisheye", FOUR),
     "OpenCV's earlier keys": ("%YAML:1.0\n" + OLD, "pinhole", FIVE),
+    "OpenCV's interactive-calibration, XML": (INTERACTIVE_XML, "pinhole", FIVE),
+    "OpenCV's interactive-calibration, YAML": (INTERACTIVE, "pinhole", FIVE),
     "OpenCV's JSON": (JSON, "pinhole", FIVE),
     "OpenVINS": (OPENVINS, "pinhole", FOUR),
     "ROS without a model": (ROS_OLD, "pinhole", FIVE),
@@ -172,13 +233,17 @@ def test_files_are_read_as_other_programs_write_them(rig, tmp_path, name: str) -
         (EUROC.replace("distortion_model", "model"), "distortion_model is missing: one of plumb_"),
         (OPENVINS.replace("intrinsics", "k"), "cam0: intrinsics is missing: fx, fy, cx, cy"),
         ("K: {data: 3}\nwidth: 3\nheight: 4\nroi: [1]\nd: []", "distortion_model is missing"),
+        (INTERACTIVE.replace("dist_coeffs", "d"), "dist_coeffs is missing: a list of numbers"),
+        (INTERACTIVE.replace("[ 752, 480 ]", "wide"), "cameraresolution is not width and height"),
+        (STEREO, "it has M1, M2; choose one with --entry"),
+        (STEREO.replace("D1", "d3").replace("M2", "m3"), "d1 is missing: a list of numbers"),
         (MESSAGE + LATER.replace("752", "640"), "it has 2 messages that differ; keep one"),
         (MESSAGE + "height: [\n", "it is damaged: not valid"),
         (MESSAGE + "height\n", "it has 2 messages that differ"),
         (MESSAGE.replace("0.5]", "0, 0, 0, 0.1]"), "plumb_bob has 5 coefficients, not 8"),
         (T265.replace("0.0]", "0.1]"), "equidistant has 4 coefficients, not 5"),
         (EUROC.replace("0.00002]", "0.00002, 0.1]"), "radial-tangential has 4 coefficients, not 5"),
-        ("sensor_type: imu\n", "it has none of the keys camera_matrix, K, intrinsics, cam0"),
+        ("sensor_type: imu\n", "it has none of the keys camera_matrix, cameraMatrix, K, "),
         ("{'lensmodel': 'LENSMODEL_PINHOLE', 'imagersize': [9, 9]}", "intrinsics is missing: fx"),
     ],
 )  # fmt: skip
@@ -188,6 +253,24 @@ def test_the_message_names_the_key_and_what_is_expected(rig, tmp_path, text, why
     with pytest.raises(BadInput) as caught:
         imported_camera(file, rig)
     assert why in str(caught.value.why)
+
+
+def test_a_camera_of_a_stereo_pair_is_chosen_and_has_the_size_of_the_rig_file(
+    rig, tmp_path
+) -> None:
+    """OpenCV's sample stereo_calib writes no image size."""
+    file, remarks, name = tmp_path / "intrinsics.yml", Remarks([]), rig.cameras[0].name
+    file.write_text(STEREO)
+    size = (rig.cameras[0].width, rig.cameras[0].height)
+    camera = write_rig_with_camera(tmp_path / "new.yaml", rig, name, file, "M2", remarks)
+    assert numbers_of(camera) == ("pinhole", size, FOCAL, FIVE)
+    text = f"has no image size; that of the rig file, {size[0]} x {size[1]} px, is assumed"
+    assert text in remarks.texts[0]
+    file.write_text(STEREO + "image_width: 752\nimage_height: 480\n")
+    assert numbers_of(imported_camera(file, rig, "M1"))[1] == (752, 480)
+    with pytest.raises(BadInput) as caught:
+        imported_camera(file, rig, "M3")
+    assert "it has M1, M2, but not 'M3'" in str(caught.value.why)
 
 
 def test_an_import_leaves_out_the_error_of_measurements_and_states_the_next_step(
@@ -225,6 +308,9 @@ def test_an_import_leaves_out_the_error_of_measurements_and_states_the_next_step
         ((0.0, 0.0), "(0, 0) px is at the edge of"),
         ((-1.0, 246.0), "is outside the image"),
         ((362.5, 481.0), "is outside the image"),
+        ((240.0, 376.0), "that of an image of 480 x 752 px; check whether width and height, 752 x"),
+        ((230.0, 390.0), "that of an image of 480 x 752 px"),
+        ((300.0, 300.0), ""),
     ],
 )
 def test_a_principal_point_far_from_the_middle_is_questioned(

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from calibration.result_files import load_result
 from calibration.results import write_result
-from calibration.tag_map.bundle_adjustment import (
-    TagLayout,
+from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
+from calibration.tag_map.observations import (
+    TagObservations,
+    TagViews,
     connected_tags,
-    measure_layout,
-    require_tags,
+    moved_tags,
 )
-from calibration.tag_map.observations import TagObservations, TagViews, moved_tags
-from calibration.tag_map.result import judge_layout, tags_result
+from calibration.tag_map.result import judge_layout, layout_facts, tags_page, tags_result
 from model.errors import BadInput
 from model.pose import Pose
 from model.rig import Rig, Tag, load_rig, rig_from_document
@@ -142,6 +142,14 @@ def test_slopes_are_those_of_finite_differences(rig: Rig) -> None:
         numeric[:, column] = (ends[0] - ends[1]) / 2e-6
     scale = np.abs(exact).max()
     np.testing.assert_allclose(exact / scale, numeric / scale, atol=1e-6)
+    by_size = views.size_slopes(poses, tags)
+    for column in range(len(tags)):
+        ends = [
+            views.errors(poses, sized(tags, {tags[column].id: np.exp(sign * 1e-6)})).ravel()
+            for sign in (1.0, -1.0)
+        ]
+        numeric_size = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(by_size[:, column] / scale, numeric_size / scale, atol=1e-6)
 
 
 def test_what_images_do_not_determine_is_reported(rig: Rig) -> None:
@@ -159,14 +167,129 @@ def test_what_images_do_not_determine_is_reported(rig: Rig) -> None:
     assert "take images that show tag 306 together with others" in verdict.next_steps
 
 
-def test_wrong_tag_sizes_are_noticed(rig: Rig) -> None:
-    """All positions are right, but the tags were printed at 97 %."""
-    small = tuple(replace(tag, size=0.97 * tag.size) for tag in rig.platform_tags)
+@pytest.mark.parametrize("printed", [0.97, 0.8])
+def test_wrong_tag_sizes_are_the_only_cause_stated(rig: Rig, printed: float) -> None:
+    """All positions are right, but the tags were printed smaller."""
+    small = tuple(replace(tag, size=printed * tag.size) for tag in rig.platform_tags)
     found = measure_layout(rig, rig.cameras[0], session(rig, small, 24, seed=5))
     verdict = judge_layout(found, 1.0)
-    assert not verdict.good
-    assert any("larger than in the rig file" in reason for reason in verdict.reasons)
-    assert any("size_mm" in step for step in verdict.next_steps)
+    (reason,), (step,) = verdict.reasons, verdict.next_steps
+    assert reason == f"the layout is {1.0 / printed - 1.0:.1%} larger than in the rig file"
+    assert "size_mm" in step
+
+
+def mistaken(rig: Rig, change) -> Rig:
+    """The rig with a mistake in each of its tags, or in their order."""
+    return replace(rig, platform_tags=tuple(change(rig.platform_tags)))
+
+
+def rotated(tag: Tag, rotation: np.ndarray) -> Tag:
+    return replace(tag, pose=Pose(tag.pose.position, rotation))
+
+
+def read_as_wxyz(tag: Tag) -> Tag:
+    """Its quaternion was written as x, y, z, w."""
+    numbers = np.roll(tag.pose.quaternion, -1)
+    return rotated(tag, Pose.from_quaternion(tag.pose.position, numbers).rotation)
+
+
+def renumbered(tags: tuple[Tag, ...], numbers: dict[int, int]) -> list[Tag]:
+    return [replace(tag, id=numbers.get(tag.id, tag.id)) for tag in tags]
+
+
+def sized(tags: tuple[Tag, ...], sizes: dict[int, float]) -> tuple[Tag, ...]:
+    return tuple(replace(tag, size=sizes.get(tag.id, 1.0) * tag.size) for tag in tags)
+
+
+UPSIDE_DOWN = np.diag([-1.0, -1.0, 1.0])
+MISTAKES = {
+    "rotated": (
+        lambda tags: [rotated(tag, tag.pose.rotation @ UPSIDE_DOWN) for tag in tags],
+        "all tags fit if each is mounted rotated by 180° about its normal, as AprilTags drawn by",
+        "multiply the rotation_wxyz of each in the rig file by [0, 0, 0, 1] from the right",
+    ),
+    "xyzw": (
+        lambda tags: [read_as_wxyz(tag) for tag in tags],
+        "all tags fit if the numbers of rotation_wxyz are read as x, y, z, w",
+        "write w first in the rotation_wxyz of tags.platform in the rig file",
+    ),
+    "two exchanged": (
+        lambda tags: renumbered(tags, {302: 305, 305: 302}),
+        "all tags fit if tag 302 is at the pose of tag 305 and tag 305 is at the pose of tag 302",
+        "exchange the ids of tags 302 and 305 in the rig file, or the prints",
+    ),
+    "three exchanged": (
+        lambda tags: renumbered(tags, {302: 303, 303: 305, 305: 302}),
+        "all tags fit if tag 302 is at the pose of tag 303 and tag 303 is at the pose of tag 305"
+        " and tag 305 is at the pose of tag 302",
+        "exchange the ids of tags 302 and 303 and 305 in the rig file, or the prints",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_in_the_rig_file_is_the_only_cause_stated(rig: Rig, name: str) -> None:
+    change, cause, step = MISTAKES[name]
+    observations = session(rig, as_mounted(rig, np.random.default_rng(1)), 24, seed=2)
+    found = measure_layout(mistaken(rig, change), rig.cameras[0], observations)
+    assert found.reprojection < 0.05
+    verdict = judge_layout(found, 0.2e-3)
+    (reason,), (found_step,) = verdict.reasons, verdict.next_steps
+    assert reason.startswith(cause)
+    assert found_step.startswith(step)
+
+
+def test_two_tags_of_other_sizes_with_exchanged_numbers_are_named(rig: Rig) -> None:
+    tags = sized(rig.platform_tags, {302: 0.7, 305: 1.2})
+    observations = session(rig, tags, 24, seed=2)
+    wrong = mistaken(rig, lambda _: renumbered(tags, {302: 305, 305: 302}))
+    found = measure_layout(wrong, rig.cameras[0], observations)
+    verdict = judge_layout(found, 0.2e-3)
+    assert verdict.next_steps == (
+        "exchange the ids of tags 302 and 305 in the rig file, or the prints",
+    )
+    assert found.has_failed
+
+
+def test_no_size_is_stated_if_less_than_half_of_the_tags_have_theirs(rig: Rig) -> None:
+    numbers = [tag.id for tag in rig.platform_tags]
+    tags = sized(
+        rig.platform_tags, dict(zip(numbers, (0.8, 0.9, 1.0, 1.05, 1.1, 1.2), strict=True))
+    )
+    observations = session(rig, tags, 16, seed=2)
+    wrong = mistaken(rig, lambda own: [replace(tag, size=0.09) for tag in own])
+    verdict = judge_layout(measure_layout(wrong, rig.cameras[0], observations), 0.2e-3)
+    assert any(
+        step.startswith("check sizes and numbers of the tags") for step in verdict.next_steps
+    )
+    assert not any("wide" in reason for reason in verdict.reasons)
+
+
+@pytest.mark.parametrize("factor", [0.6, 0.9, 1.04])
+def test_a_tag_of_wrong_size_is_named_alone(rig: Rig, factor: float) -> None:
+    tags = sized(rig.platform_tags, {304: factor})
+    found = measure_layout(rig, rig.cameras[0], session(rig, tags, 24, seed=2))
+    verdict = judge_layout(found, 0.2e-3)
+    wide, stated = rig.platform_tags[3].size * 1e3 * factor, rig.platform_tags[3].size * 1e3
+    reason = next(text for text in verdict.reasons if "reprojection" in text)
+    assert f"the images fit if tag 304 is {wide:.1f} mm wide, not {stated:g} mm" in reason
+    step = "measure the black square of tag 304 and correct size_mm in the rig file"
+    assert step in verdict.next_steps
+    assert all("only one tag" in why for why in found.unused.values())
+    if found.has_failed:
+        assert len(verdict.reasons) == 1
+        assert [name for name, _ in layout_facts(found)] == ["images"]
+
+
+def test_a_failed_fit_states_no_layout(rig: Rig) -> None:
+    """Corners are off by several pixels: neither poses nor sizes explain the images."""
+    observations = session(rig, rig.platform_tags, 24, seed=2, noise=4.0)
+    found = measure_layout(rig, rig.cameras[0], observations)
+    verdict = judge_layout(found, 0.2e-3)
+    assert verdict.reasons == (f"the reprojection error is {found.reprojection:.2f} px",)
+    result = tags_result(found, verdict, rig.document, date(2026, 3, 4))
+    assert result.in_words() == []
+    assert "Tags against the rig file" not in tags_page(found, result, verdict)
 
 
 def test_a_tag_that_was_glued_elsewhere_is_named(rig: Rig) -> None:

@@ -10,7 +10,14 @@ import pytest
 from model.plan import save_plan
 from model.rig import load_rig
 from model.scene import load_scene
-from tests.cli.plans import CONFIGS, HALL, RIG, straight_plan
+from tests.cli.plans import (
+    CONFIGS,
+    HALL,
+    RIG,
+    free_scene,
+    rig_with_long_cycles,
+    straight_plan,
+)
 from tests.cli.program import Answer, call, nothing_written, one_message
 
 
@@ -111,3 +118,19 @@ def test_check_reports_every_violation_with_its_position_and_exits_3(tmp_path: P
     assert checked.code == 3
     assert json.loads(checked.out)["passed"] is False
     assert json.loads(checked.out)["violations"]
+
+
+@pytest.mark.parametrize(("speed_mm_s", "refused"), [(20, False), (90, True)])
+def test_check_remarks_on_a_path_that_a_run_refuses_as_it_cannot_stop_before_obstacles(
+    tmp_path: Path, speed_mm_s: int, refused: bool
+) -> None:
+    rig = rig_with_long_cycles(tmp_path)
+    rig.write_text(rig.read_text().replace("  speed_mm_s: 20", f"  speed_mm_s: {speed_mm_s}"))
+    plan = tmp_path / "plan.json"
+    ends = [(-20.0, 0.0, 150.0), (-20.0, 20.0, 160.0)]
+    save_plan(straight_plan(load_rig(rig), free_scene(*ends), ends), plan)
+    checked = call("check", plan)
+    assert checked.code == 0
+    assert ("may be refused: the path comes within" in checked.err) is refused
+    ran = call("run", plan, "--fast", "--no-camera", "-o", tmp_path / "run")
+    assert (ran.code == 3 and "without its master" in ran.err) is refused

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -557,3 +558,11 @@ def test_a_working_folder_that_is_gone_is_named(
     monkeypatch.chdir(gone)
     gone.rmdir()
     one_message(call(*verb), 2, "the current folder was removed", "next: change to a folder")
+
+
+def test_too_few_open_files_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(*_: object) -> None:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    monkeypatch.setattr("cdpr.cli.operate.run.RunFolder.open_cut_short", none_left)
+    one_message(call("report", tmp_path), 1, "no more open files", "ulimit -n")

@@ -8,6 +8,7 @@ from dataclasses import fields
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -365,3 +366,16 @@ def test_the_table_of_cables_is_never_replaced_by_the_rig(
         with nothing_written(tmp_path):
             answer = call("new", rig, "--from", table, *force)
         one_message(answer, 2, "would overwrite an input")
+
+
+def test_the_platform_is_the_box_of_the_anchors_where_only_they_are_known(tmp_path: Path) -> None:
+    rig = tmp_path / "rig.yaml"
+    big = [[10.0 * x for x in point] for point in PAPER.document.anchors_mm]
+    ends = zip(PAPER.document.outlets_mm, big, strict=True)
+    lines = [",".join(map(str, [*(10.0 * x for x in outlet), *anchor])) for outlet, anchor in ends]
+    (tmp_path / "cables.csv").write_text("\n".join([",".join(CSV_COLUMNS), *lines]) + "\n")
+    answer = call("new", rig, "--from", tmp_path / "cables.csv")
+    assert answer.code == 0, answer
+    half = 0.5 * np.array(load_rig(rig).document.platform.size_mm)
+    assert (half >= np.abs(big).max(axis=0)).all()
+    assert (half <= np.maximum(np.abs(big).max(axis=0), 0.1 * np.abs(big).max()) + 0.1).all()

@@ -111,9 +111,10 @@ def test_cameras_of_different_rates_are_paired_by_name_to_the_end_of_the_longest
     uneven.write_text(yaml.safe_dump(data))
     rig, scene = load_rig(uneven), load_plan(plan).scene
     for camera, numbers in zip(rig.cameras, (range(5), (0, 2)), strict=True):
-        picture = SyntheticCamera(rig, scene, camera, seed=1).render(scene.start, 0)
+        synthetic = SyntheticCamera(rig, scene, camera, seed=1)
         (tmp_path / camera.name).mkdir()
         for number in numbers:
+            picture = synthetic.render(scene.start, number)
             cv2.imwrite(str(tmp_path / camera.name / f"{number}.png"), picture)
     log, drawn = tmp_path / "poses.csv", tmp_path / "drawn.avi"
     sources = [f"{name}={tmp_path / name}" for name in ("front", "side")]

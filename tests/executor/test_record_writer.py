@@ -113,6 +113,41 @@ def test_a_disk_that_hangs_holds_nothing_up_and_is_a_fault_when_it_is_far_behind
             goes_on.set()
 
 
+def test_a_suspended_program_is_not_a_slow_disk(folder: RunFolder) -> None:
+    """Nothing waits for the disk in the 6 s without a cycle."""
+    log: Any = Log()
+    written = threading.Event()
+    with RecordWriter(folder, log, own_thread=True) as writer:
+        log.count = 1
+        writer.take_cycles(5.0)
+        writer.take_file(written.set)
+        assert written.wait(60.0)
+        log.count = 2
+        writer.take_cycles(5.0 + BEHIND + 1.0)
+        writer.take_event(RunEvent(6.0, "late", "a cycle began late"))
+    assert recorded(folder) == [0, 1]
+
+
+def test_a_program_suspended_during_a_write_counts_only_the_rest_as_a_delay(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk, log, at = Disk(monkeypatch), Log(), 5.0
+    with RecordWriter(folder, log, own_thread=True) as writer:  # type: ignore[arg-type]
+        try:
+            log.count = 1
+            writer.take_cycles(at)
+            assert disk.begins.wait(60.0)
+            at += BEHIND + 1.0
+            for number in range(round(BEHIND / CYCLE)):
+                log.count += 1
+                writer.take_cycles(at + number * CYCLE)
+            log.count += 1
+            with pytest.raises(Fault, match=r"5\.\d s behind the run"):
+                writer.take_cycles(at + BEHIND + 0.5)
+        finally:
+            disk.goes_on.set()
+
+
 class Disk:
     """Keeps the first write until it is let go."""
 

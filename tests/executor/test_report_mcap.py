@@ -287,6 +287,17 @@ def test_a_full_disk_leaves_no_broken_log(
     assert not folder.mcap.exists()
 
 
+def test_poses_fused_after_reading_the_tables_are_the_same(
+    run: fake_run.FakeRun, tmp_path: Path
+) -> None:
+    """Images at the times of cycles, apart by less than the tables show."""
+    late = replace(run, poses=replace(run.poses, time=run.poses.time + 1e-12))
+    folder = fake_run.write(late, tmp_path / "run", pictures=False)
+    again = fused_table(folder.cycles(), folder.poses())
+    assert again.csv_rows() == fused_table(late.cycles, late.poses).csv_rows()
+    assert again.age.min() == 0.0
+
+
 def test_an_image_in_a_gap_of_the_encoder_poses_corrects_none(run: fake_run.FakeRun) -> None:
     """The poses around the gap say nothing about where the platform was in between."""
     cycles, poses = run.cycles, run.poses

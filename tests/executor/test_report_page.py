@@ -72,6 +72,16 @@ def page(run: fake_run.FakeRun, tmp_path_factory: pytest.TempPathFactory) -> Pag
     return built(run, tmp_path_factory.mktemp("page") / "run", pictures=True)
 
 
+def test_an_image_taken_just_before_the_start_is_at_zero(
+    run: fake_run.FakeRun, tmp_path: Path
+) -> None:
+    """By the camera's latency."""
+    early = replace(run, poses=replace(run.poses, time=run.poses.time - 0.02))
+    page = built(early, tmp_path / "run", pictures=True)
+    assert "<b>0.0 s</b>" in page.text
+    assert "-0.0 s" not in page.text
+
+
 def test_the_verdict_comes_first_and_every_section_is_there(page: Page) -> None:
     assert page.headings == [
         "Run of environment_3 on gachon_8_6",

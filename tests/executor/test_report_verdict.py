@@ -402,6 +402,13 @@ def test_a_clearance_fails_only_when_too_small_beyond_its_uncertainty(
     assert (float(upper) >= 10.0) is passed, "a verdict contradicts its own figures"
 
 
+def test_a_clearance_measured_just_before_the_start_is_at_zero() -> None:
+    """By the camera's latency."""
+    measured = rows("tag", 20.0, 0.0, 9.0)
+    early = replace(measured, time=np.full(len(measured), -0.02))
+    assert "at 0.0 s" in distances(early, 0.010)[0].text
+
+
 @pytest.mark.parametrize("side", [9.9, 10.1])
 @pytest.mark.parametrize("together", [True, False])
 def test_a_clearance_that_one_of_several_cameras_measures_counts_too(

@@ -201,7 +201,7 @@ def eight_drives(cycle_ms: int) -> str:
 @pytest.mark.parametrize(
     ("page", "words"),
     [
-        ("odrive.md", f"from rest by {fall(15)}, {fall(30)} and {fall(50)}"),
+        ("safety.md", f"from rest by {fall(15)}, {fall(30)} and {fall(50)}"),
         (
             "console.md",
             f"{percent(RESERVE)} of the range from half of `min_tension_n` to the limit, but at"

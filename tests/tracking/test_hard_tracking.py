@@ -133,7 +133,24 @@ def test_two_prints_of_one_tag_are_ambiguous(rig: Rig, camera: Camera, empty: Sc
     image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
     found = Tracker(one, camera).observe(image, 0.0)
     assert isinstance(found, NoPose)
-    assert "inconsistent" in found.reason
+    assert found.reason == "tag 305 is seen more than once"
+    with pytest.raises(NoPlatformSeen) as caught:
+        list(track([Frame(0.0, image, "a.png")], Tracker(one, camera)))
+    assert "another print" in caught.value.why
+    assert "remove or cover the second print" in caught.value.next_step
+
+
+def test_tags_in_view_are_not_reported_as_missing(rig: Rig, camera: Camera, empty: Scene) -> None:
+    """Two tags that do not fit the rig file, each printed once, beside the tags of the frame."""
+    tag = rig.platform_tags[0]
+    apart = replace(tag, pose=replace(tag.pose, position=tag.pose.position + 0.08 * FLAT[1]))
+    real = replace(rig, platform_tags=(apart, *rig.platform_tags[4:5]))
+    wrong = replace(rig, platform_tags=(tag, *rig.platform_tags[4:5]))
+    image = SyntheticCamera(real, empty, camera, seed=4).render(HERE, 0)
+    with pytest.raises(NoPlatformSeen, match="inconsistent positions") as caught:
+        list(track([Frame(0.0, image, "a.png")], Tracker(wrong, camera)))
+    assert caught.value.why == "expected tag36h11 tags 301, 305"
+    assert "size_mm" in caught.value.next_step
 
 
 def test_another_print_of_a_frame_tag_does_not_move_the_camera(

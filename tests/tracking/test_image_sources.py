@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import cv2
@@ -14,8 +16,9 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from calibration.images import open_source
-from drivers.cameras.files import ImageFolder, SingleCameraImages, first_gap
+from drivers.cameras.files import ImageFolder, SingleCameraImages, image_files
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
+from executor.cameras.sources import first_gap
 from model.errors import BadInput, HardwareMissing
 from model.pose import Pose
 from model.rig import Camera, Rig
@@ -48,6 +51,28 @@ def test_a_folder_is_read_in_the_order_of_its_numbers(folder: Path, camera: Came
     np.testing.assert_allclose([frame.time for frame in frames], [0.0, 0.1, 0.2, 0.3])
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["frame_9.png", "frame_10.png", "frame_100.png"],
+        ["9.1.png", "9.2.png", "10.1.png"],
+        ["take1.8.png", "take1.9.png", "take1.10.png", "take1.11.png", "take2.1.png"],
+        ["take1.099.png", "take1.100.png", "take1.101.png"],
+        ["1763000000.66704.png", "1763000000.699895.png", "1763000000.7.png", "1763000001.0.png"],
+        ["cam2_999999999.9.png", "cam2_1000000000.66704.png", "cam2_1000000000.7.png"],
+        ["0.0.png", "0.03.png", "0.07.png", "0.1.png", "0.13.png"],
+        ["1.5.png", "1.625.png", "1.75.png", "other.png"],
+    ],
+)
+def test_images_are_in_the_order_of_their_numbers_or_times(
+    tmp_path: Path, names: list[str]
+) -> None:
+    """Python writes 0.7 for 0.700000: the digits after the point are no number of their own."""
+    for name in reversed(names):
+        (tmp_path / name).touch()
+    assert [path.name for path in image_files(tmp_path)] == names
+
+
 @given(
     count=st.integers(3, 40),
     step=st.sampled_from([1, 10, 33_333_333]),
@@ -65,6 +90,28 @@ def test_a_gap_in_the_numbers_of_names_is_found(
     assert first_gap(names) == (names[lost - 1], names[lost])
 
 
+def _utc(form: str, time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime(form)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        lambda ns: f"{ns / 1e9}.png",
+        lambda ns: f"{ns // 10**9}.{ns % 10**9:09d}.png",
+        lambda ns: f"frame_{ns // 10**9}_{ns % 10**9 // 1000:06d}.jpg",
+        lambda ns: _utc("%Y-%m-%dT%H-%M-%S.%f.png", ns),
+        lambda ns: _utc("%Y%m%d_%H%M%S_%f.png", ns),
+        lambda ns: _utc("%Y%m%d_%H%M%S_%f", ns)[:-3] + ".png",
+    ],
+)
+def test_a_gap_in_seconds_and_their_fractions_is_found(name: Callable[[int], str]) -> None:
+    """Over the end of a minute, at 30 images per second."""
+    names = [name(1_763_000_038_000_000_000 + k * 33_366_700) for k in range(90)]
+    assert first_gap(names) is None
+    assert first_gap(names[:40] + names[41:]) == (names[39], names[41])
+
+
 @pytest.mark.parametrize(
     "names",
     [
@@ -77,6 +124,10 @@ def test_a_gap_in_the_numbers_of_names_is_found(
         [f"PXL_20261127_{time}.jpg" for time in (175959640, 175959970, 180000300, 180000630)],
         ["20261127175957.png", "20261127175959.png", "20261127180001.png"],
         ["left_1.png", "left_2.png", "right_1.png", "right_2.png"],
+        ["1_000001.png", "1_000002.png", "2_000001.png", "2_000002.png"],
+        ["1.1.png", "1.2.png", "1.3.png", "2.1.png", "2.2.png"],
+        [f"IMG_20261127_{name}.jpg" for name in ("175959_001", "175959_002", "180000_001")],
+        [f"20261127_{name}.jpg" for name in ("235959_500", "235959_900", "000000_300")],
     ],
 )
 def test_names_without_consecutive_numbers_have_no_gap(names: list[str]) -> None:

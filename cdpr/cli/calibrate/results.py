@@ -151,13 +151,13 @@ def import_(
     file: Path = argument("camera file of OpenCV, ROS, Kalibr or mrcal", "CAMERA"),
     output: Path = required("rig file to write; must not exist", "-o", "--output"),
     camera: str | None = CAMERA,
-    entry: str | None = option("camera of a Kalibr camchain with several, such as cam1"),
+    entry: str | None = option("which of several cameras in the file: Kalibr's cam1, OpenCV's M2"),
     as_json: bool = JSON,
 ) -> None:
     """Write a new rig file with a camera's matrix and lens from another program.
 
-    CAMERA is OpenCV's YAML, ROS's camera_info, Kalibr's camchain or mrcal's .cameramodel. These
-    files state no uncertainty; `cdpr calibrate camera` does.
+    CAMERA is OpenCV's YAML, XML or JSON, ROS's camera_info, Kalibr's camchain or mrcal's
+    .cameramodel. These files state no uncertainty; `cdpr calibrate camera` does.
 
     Example:
       cdpr calibrate import rig.yaml camera_info.yaml --camera front -o rig_with_lens.yaml
