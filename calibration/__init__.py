@@ -9,6 +9,7 @@ from model.lazy import lazy_names
 if TYPE_CHECKING:
     from calibration.extrinsics.camera_pairs import locate_camera_by_another
     from calibration.extrinsics.result import ExtrinsicsResult
+    from calibration.extrinsics.surveyed_tags import Survey
     from calibration.geometry.pose_selection import measurement_poses
     from calibration.geometry.result import RigResult
     from calibration.intrinsics.readout import ReadoutResult
@@ -31,6 +32,7 @@ __all__ = [
     "ReadoutResult",
     "ResultDocument",
     "RigResult",
+    "Survey",
     "TagGrid",
     "TagsResult",
     "calibrate_camera_from_corners",
@@ -47,6 +49,7 @@ if not TYPE_CHECKING:
         {
             "calibration.extrinsics.camera_pairs": "locate_camera_by_another",
             "calibration.extrinsics.result": "ExtrinsicsResult",
+            "calibration.extrinsics.surveyed_tags": "Survey",
             "calibration.geometry.pose_selection": "measurement_poses",
             "calibration.geometry.result": "RigResult",
             "calibration.intrinsics.readout": "ReadoutResult",

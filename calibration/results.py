@@ -88,6 +88,15 @@ class CalibrationVerdict:
         return f"not good enough: {'; '.join(self.reasons)}"
 
 
+def beyond(error: float, wanted: float) -> str:
+    """An error and the smaller one that is required, as numbers that differ, [m]."""
+    for digits in (2, 3):
+        found, needed = (f"{value * 1e3:.{digits}g}" for value in (error, wanted))
+        if found != needed:
+            return f"{found} mm; {needed} mm are required"
+    return f"just over {needed} mm; {needed} mm are required"
+
+
 # Result files.
 
 

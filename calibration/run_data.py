@@ -1,13 +1,13 @@
-"""Run data for calibration: encoder poses and stationary samples."""
+"""Run data for calibration: poses by image and stationary samples."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from calibration.extrinsics.hand_eye import read_poses
 from calibration.geometry.measurements import (
     Recording,
     RigMeasurements,
@@ -17,7 +17,8 @@ from calibration.geometry.measurements import (
 )
 from calibration.geometry.result import require_same_nominal
 from executor.recording.run_folder import RunFolder
-from model.errors import BadInput
+from model.errors import BadInput, InvalidFile, Problem
+from model.files.csv_table import CsvTable
 from model.files.reading import is_folder
 from model.pose import Array, Pose, interpolate, matrix_from_quaternion
 from model.rig import Rig
@@ -63,6 +64,61 @@ def poses_of_run(folder: Path, camera: str) -> dict[str, Pose]:
         share = float((time - times[after - 1]) / (times[after] - times[after - 1]))
         poses[Path(picture).name] = interpolate(ends[0], ends[1], share)
     return poses
+
+
+# CSV file of platform poses by image name, with units in its column names.
+
+
+COLUMNS = ("picture", "x_mm", "y_mm", "z_mm", "qw", "qx", "qy", "qz")
+"""As in the pose log of `cdpr track`; other columns are ignored."""
+
+
+def read_poses(path: Path) -> dict[str, Pose]:
+    """Reads ``world_from_platform`` by image; rows without a pose are left out.
+
+    Raises:
+        BadInput: The file cannot be read, or a column or a value is missing.
+        InvalidFile: With every invalid row.
+    """
+    table = CsvTable(path)
+    table.require(COLUMNS)
+    names, *columns = (table.texts(name) for name in COLUMNS)
+    states = table.texts("status") if "status" in table.names else None
+    poses: dict[str, Pose] = {}
+    problems = []
+    for row, (name, *values) in enumerate(zip(names, *columns, strict=True)):
+        picture = Path(name).name
+        kept = states is None or (picture and states[row] == "ok")
+        if not kept or not any(values):  # a log's row without a pose, or without a kept image
+            continue
+        found = _pose(values)
+        if isinstance(found, str):
+            problems.append(Problem(picture, found, table.line(row), 1))
+        elif not picture or picture in poses:
+            what = "this image appears twice" if picture else "no image is named"
+            problems.append(Problem(picture, what, table.line(row), 1))
+        else:
+            poses[picture] = found
+    if problems:
+        raise InvalidFile(str(path), problems)
+    return poses
+
+
+def _pose(values: list[str]) -> Pose | str:
+    """The pose, or a message about what is wrong with it."""
+    try:
+        numbers = np.array([float(value) for value in values])
+    except ValueError:
+        return f"{', '.join(values)} are not seven numbers"
+    if not all(map(math.isfinite, numbers)):
+        return "a number is not finite"
+    length = float(np.linalg.norm(numbers[3:]))
+    if abs(length - 1.0) > 1e-3:
+        return f"qw, qx, qy, qz must have length 1; the length is {length:.4g}"
+    return Pose.from_quaternion(numbers[:3] / 1e3, numbers[3:] / length)
+
+
+# Encoder positions and poses at rest, for the rig's geometry.
 
 
 def rig_measurements(

@@ -155,7 +155,7 @@ _OTHERS = {
     "Listener": "an object of a subclass of model.progress.Listener, or leave it out",
     "Board": "a cdpr.Chessboard, or another board of `calibration`",
     "Camera": "rig.camera(), or rig.camera(name)",
-    "Survey": "a calibration.extrinsics.surveyed_tags.Survey, or leave it out",
+    "Survey": "a calibration.Survey, or leave it out",
 }
 
 

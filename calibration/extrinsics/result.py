@@ -19,6 +19,7 @@ from calibration.results import (
     Destination,
     Issue,
     ResultDocument,
+    beyond,
     common_keys,
 )
 from calibration.statistics import Interval, rms_bound, student_factor
@@ -48,6 +49,9 @@ class ExtrinsicCalibration:
         issues: Issues beside precision.
         data_hash: Of the observations.
         reference_camera: The other camera, where the pose was found by one.
+        is_contradictory: Whether the data contradict each other: then the stated error is
+            meaningless.
+        details: Human-readable facts about the data.
     """
 
     camera: Camera
@@ -62,6 +66,8 @@ class ExtrinsicCalibration:
     issues: tuple[Issue, ...]
     data_hash: str
     reference_camera: str | None = None
+    is_contradictory: bool = False
+    details: tuple[tuple[str, str], ...] = ()
 
     @property
     def world_from_camera(self) -> Pose:
@@ -107,7 +113,7 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
         wanted: Required error in the work space, [m].
     """
     issues, error = list(result.issues), result.error
-    if not error <= wanted:
+    if not error <= wanted and not result.is_contradictory:
         more = "survey more tags, all around the camera's view"
         if result.by == "rig motion":
             more = "take images at more poses, far apart and rotated up to 20° in every direction"
@@ -117,10 +123,7 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
             more = (
                 "calibrate the camera's lens with more images, all over the image: it causes most"
             )
-        what = (
-            f"points of the workspace are measured within {error * 1e3:.2g} mm;"
-            f" {wanted * 1e3:.2g} mm are required"
-        )
+        what = f"points of the workspace are measured within {beyond(error, wanted)}"
         issues.append(Issue(what, more))
     return CalibrationVerdict.of(error, wanted, "in the workspace", issues)
 
@@ -344,6 +347,7 @@ def extrinsics_page(
                 table_of(moved_rows(before, result.world_from_camera)),
             ),
             Section("Tags", table_of(tags), "RMS error of their corners."),
+            *([Section("Poses", table_of(result.details))] if result.details else []),
             Section("Not used", table_of(result.unused.items())),
         ],
     )
@@ -354,6 +358,7 @@ def extrinsics_facts(found: ExtrinsicCalibration, before: Pose) -> list[tuple[st
     return [
         ("by", f"{found.by}, {found.pictures} images"),
         *((f"tag {k}", f"{error:.3f} px") for k, error in found.tag_errors.items()),
+        *found.details,
         *moved_rows(before, found.world_from_camera),
     ]
 

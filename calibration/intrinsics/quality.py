@@ -10,7 +10,7 @@ import numpy as np
 
 from calibration.intrinsics.calibrate import CameraCalibration
 from calibration.intrinsics.lens import LENSES, RADIAL, radial_share
-from calibration.results import CalibrationVerdict, Issue
+from calibration.results import CalibrationVerdict, Issue, beyond
 from calibration.targets.boards import Charuco
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
@@ -402,10 +402,7 @@ def _error_issues(
         step = "take sharp images of a flat board, held still, and check its dimensions"
         issues.append(Issue(what, step))
     if not error <= wanted:
-        what = (
-            f"points at {distance:.2g} m are measured within {error * 1e3:.2g} mm;"
-            f" {wanted * 1e3:.2g} mm are required"
-        )
+        what = f"points at {distance:.2g} m are measured within {beyond(error, wanted)}"
         issues.append(Issue(what, _more(result)))
         share = float(np.mean(coverage > 0))
         if not is_below(share, GOOD_COVERAGE) and is_below(share, FULL_COVERAGE):

@@ -22,7 +22,7 @@ from scipy.optimize import minimize_scalar
 from calibration.images import ImageSet
 from calibration.intrinsics.result import camera_named, with_camera
 from calibration.report import Section, interval_rows, page_of, table_of
-from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
+from calibration.results import CalibrationVerdict, Issue, ResultDocument, beyond, common_keys
 from calibration.statistics import Interval, student_factor
 from calibration.tag_map.observations import TagObservations
 from drivers.cameras.files import ImageFolder
@@ -254,7 +254,7 @@ def judge_readout(found: ReadoutCalibration, wanted: float, speed: float) -> Cal
     if len(found.speeds) < GOOD:
         issues.append(Issue(f"{len(found.speeds)} images were used; {GOOD} are required", step))
     if not error <= wanted:
-        what = f"the error is {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
+        what = f"the error is {beyond(error, wanted)}"
         issues.append(Issue(what, step))
     where = f"at {speed * 1e3:.0f} mm/s"
     return CalibrationVerdict.of(error, wanted, where, issues)

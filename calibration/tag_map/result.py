@@ -13,7 +13,13 @@ from pydantic import Field
 
 from calibration.extrinsics.result import AXES, SCALES, pose_rows
 from calibration.report import Section, page_of, table_of
-from calibration.results import CalibrationVerdict, Issue, ResultDocument, common_keys
+from calibration.results import (
+    CalibrationVerdict,
+    Issue,
+    ResultDocument,
+    beyond,
+    common_keys,
+)
 from calibration.statistics import Interval
 from calibration.tag_map.bundle_adjustment import (
     FAILED_ERROR,
@@ -280,7 +286,7 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
 
 
 def _too_inaccurate(error: float, wanted: float) -> Issue:
-    what = f"tags are located within {error * 1e3:.2g} mm; {wanted * 1e3:.2g} mm are required"
+    what = f"tags are located within {beyond(error, wanted)}"
     return Issue(what, "take more images, closer, sharp and from all sides")
 
 

@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calibration import Survey
 from calibration.extrinsics.result import (
     ExtrinsicCalibration,
     extrinsics_result,
     judge_extrinsics,
     workspace_corners,
 )
-from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
+from calibration.extrinsics.surveyed_tags import locate_by_frame_tags, require_frame_tags
 from calibration.result_files import load_result
 from calibration.results import write_result
 from calibration.tag_map.observations import TagObservations, observe_tags

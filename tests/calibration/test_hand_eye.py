@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from calibration.extrinsics.hand_eye import locate_by_motion, read_poses
+from calibration.extrinsics.hand_eye import locate_by_motion
 from calibration.extrinsics.result import judge_extrinsics
+from calibration.run_data import read_poses
 from calibration.tag_map.observations import TagObservations
 from model.errors import BadInput, InvalidFile
 from model.pose import Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
@@ -154,6 +157,162 @@ def test_pictures_without_a_pose_are_named_and_too_few_are_refused(rig: Rig) -> 
     few = {name: encoder[name] for name in ("0.png", "1.png")}
     with pytest.raises(BadInput, match="2 images show the platform at a known pose"):
         locate_by_motion(rig, rig.cameras[0], observations, few)
+
+
+# Poses and images that contradict each other.
+
+
+def with_camera(rig: Rig, longer: float) -> Rig:
+    """A rig whose camera has a focal length so many times as long."""
+    matrix = np.array(rig.cameras[0].matrix)
+    matrix[[0, 1], [0, 1]] *= longer
+    return replace(rig, cameras=(replace(rig.cameras[0], matrix=matrix),))
+
+
+def with_tags(rig: Rig, larger: float) -> Rig:
+    """A rig whose platform tags are so many times as large."""
+    tags = tuple(replace(tag, size=tag.size * larger) for tag in rig.platform_tags)
+    return replace(rig, platform_tags=tags)
+
+
+def changed(poses: dict[str, Pose], change: Callable[[Pose], Pose]) -> dict[str, Pose]:
+    return {name: change(pose) for name, pose in poses.items()}
+
+
+@pytest.mark.parametrize("longer", [0.98, 1.02])
+def test_a_wrong_focal_length_is_measured_and_never_good_enough(rig: Rig, longer: float) -> None:
+    """The fit takes most of its effect as noise of the poses: the more poses, the surer it is."""
+    images, encoder = session(with_camera(rig, longer), 40, 0.3, 3e-4, seed=11)
+    verdict = judge_extrinsics(locate_by_motion(rig, rig.cameras[0], images, encoder), 1.0)
+    assert not verdict.good
+    side = "longer" if longer > 1.0 else "shorter"
+    (reason,), (step,) = verdict.reasons, verdict.next_steps
+    found = re.fullmatch(rf"the poses fit a focal length that is (.*)% {side} than in .*", reason)
+    assert found is not None, reason
+    assert float(found[1]) == pytest.approx(2.0, abs=0.3)
+    for part in ("units of the poses", "size_mm of the tags", "camera's matrix"):
+        assert part in step
+
+
+def test_a_wrong_tag_size_is_measured_and_never_good_enough(rig: Rig) -> None:
+    images, encoder = session(with_tags(rig, 0.96), 40, 0.3, 3e-4, seed=12)
+    verdict = judge_extrinsics(locate_by_motion(rig, rig.cameras[0], images, encoder), 1.0)
+    assert "% larger than the poses" in verdict.reasons[0]
+    assert "size_mm" in verdict.next_steps[0]
+
+
+def test_poses_in_metres_are_named(rig: Rig) -> None:
+    """A file's columns are in millimetres, so that they are read as 1000 times too small."""
+    images, encoder = session(rig, 16, 0.3, 3e-4, seed=13)
+    small = changed(encoder, lambda pose: Pose(pose.position / 1e3, pose.rotation))
+    verdict = judge_extrinsics(locate_by_motion(rig, rig.cameras[0], images, small), 1.0)
+    assert "times as far as by the poses" in verdict.reasons[0]
+    assert "they seem to be in metres" in verdict.next_steps[0]
+    assert len(verdict.reasons) == 1
+
+
+def of_body(offset: Pose) -> Callable[[Pose], Pose]:
+    """The pose of a body on the platform instead of that of its origin."""
+    return lambda pose: pose.compose(offset)
+
+
+ABOVE = Pose.level([0.0, 0.0, 0.05])
+ROTATED = Pose(np.zeros(3), matrix_from_rotation_vector([0.0, 0.0, np.pi / 2]))
+
+
+@pytest.mark.parametrize(
+    ("offset", "turn", "words"),
+    [(ABOVE, 0.3, "50."), (ABOVE, 0.035, "mm"), (ROTATED, 0.3, "90.0°")],
+)
+def test_tags_that_are_elsewhere_on_the_platform_are_never_good_enough(
+    rig: Rig, offset: Pose, turn: float, words: str
+) -> None:
+    """With small rotations the camera's pose takes most of it: the stated error is far too low."""
+    images, encoder = session(rig, 40, turn, 3e-4, seed=14)
+    other = changed(encoder, of_body(offset))
+    found = locate_by_motion(rig, rig.cameras[0], images, other)
+    verdict = judge_extrinsics(found, 1.0)
+    assert not verdict.good
+    (reason,) = verdict.reasons
+    assert reason.startswith("the tags fit the poses only ")
+    assert words in reason
+    assert "4.0 mm and 2.0° are allowed" in reason
+    assert "platform's frame, not of another body" in verdict.next_steps[0]
+    assert "from the rig file" in dict(found.details)["tags' frame"]
+
+
+def wrong_order(pose: Pose) -> Pose:
+    """Its quaternion written with qw last and read with qw first."""
+    return Pose.from_quaternion(pose.position, np.roll(pose.quaternion, -1))
+
+
+MIRROR = np.diag([1.0, -1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        Pose.inverse,
+        wrong_order,
+        lambda pose: Pose(pose.position[[1, 0, 2]], pose.rotation),
+        lambda pose: Pose(MIRROR @ pose.position, MIRROR @ pose.rotation @ MIRROR),
+        lambda pose: Pose(pose.position, pose.rotation.T),
+        None,
+    ],
+    ids=["inverse", "qw last", "axes exchanged", "left-handed", "rotations inverse", "shifted"],
+)
+def test_poses_of_another_convention_are_named_as_such(
+    rig: Rig, change: Callable[[Pose], Pose] | None
+) -> None:
+    images, encoder = session(rig, 24, 0.3, 3e-4, seed=15)
+    if change is None:  # each image has the pose of the next one
+        names, poses = list(encoder), list(encoder.values())
+        other = dict(zip(names, [*poses[1:], poses[0]], strict=True))
+    else:
+        other = changed(encoder, change)
+    verdict = judge_extrinsics(locate_by_motion(rig, rig.cameras[0], images, other), 1e-3)
+    (reason,), (step,) = verdict.reasons, verdict.next_steps
+    assert re.fullmatch(r"poses and images contradict each other by [\d.]+ mm, [\d.]+°", reason)
+    for part in ("qw comes first", "units", "right-handed", "inverse", "image"):
+        assert part in step
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-3])
+def test_right_poses_are_no_contradiction_and_their_scatter_is_shown(
+    rig: Rig, noise: float
+) -> None:
+    off = Pose(np.array([1e-3, -1e-3, 1e-3]), matrix_from_rotation_vector([0.005, 0.0, -0.005]))
+    images, encoder = session(rig, 24, 0.2, noise, 16, off, pixels=0.01)
+    found = locate_by_motion(rig, rig.cameras[0], images, encoder)
+    assert not found.is_contradictory
+    assert found.issues == ()
+    shown = dict(found.details)
+    assert list(shown) == ["poses", "distances", "tags' frame"]
+    scatter = re.match(r"scatter (\S+) mm, (\S+)° about the images", shown["poses"])
+    assert scatter is not None
+    assert float(scatter[1]) == pytest.approx(1e3 * noise, rel=0.5)
+
+
+def test_slow_errors_of_the_encoders_are_no_wrong_scale(rig: Rig) -> None:
+    """They are alike in consecutive images, so that leaving out one at a time shows too little."""
+    images, encoder = session(rig, 40, 0.3, 1e-5, seed=17)
+    angles = np.linspace(0.0, 3.0 * np.pi, 40)
+    slow = {
+        name: Pose(
+            pose.position + 5e-4 * np.array([np.sin(a), np.cos(a), np.sin(a)]), pose.rotation
+        )
+        for (name, pose), a in zip(encoder.items(), angles, strict=True)
+    }
+    found = locate_by_motion(rig, rig.cameras[0], images, slow)
+    assert found.issues == ()
+
+
+def test_an_error_is_not_stated_as_what_is_required(rig: Rig) -> None:
+    found = locate_by_motion(rig, rig.cameras[0], *session(rig, 16, 0.3, 3e-4, seed=18))
+    for share in (0.9, 0.996, 0.99999):
+        (reason,) = judge_extrinsics(found, share * found.error).reasons
+        measured, required = re.findall(r"within (.*); (.*) are required", reason)[0]
+        assert measured != required
 
 
 HEAD = "picture,x_mm,y_mm,z_mm,qw,qx,qy,qz\n"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -91,6 +92,9 @@ def test_twenty_pictures_give_the_layout_to_hundredths_of_a_millimetre(rig: Rig)
     assert found.unseen == {}
     verdict = judge_layout(found, 0.2e-3)
     assert verdict.good, verdict.reasons
+    (reason,) = judge_layout(found, 0.99999 * found.error).reasons
+    measured, required = re.findall(r"within (.*); (.*) are required", reason)[0]
+    assert measured != required
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say(rig: Rig) -> None:

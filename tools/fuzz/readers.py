@@ -29,9 +29,9 @@ class Reader:
 
 def readers(corpus: dict[str, list[Path]], scratch: Path) -> list[Reader]:
     """All readers; run folders are copied into ``scratch``."""
-    from calibration.extrinsics.hand_eye import read_poses
     from calibration.geometry.measurements import read_rig_data
     from calibration.result_files import load_result
+    from calibration.run_data import read_poses
     from calibration.targets.boards import read_corners
     from cdpr.console.teach import TaughtPoses
     from drivers.cameras.files import read_image
