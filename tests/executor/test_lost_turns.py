@@ -61,7 +61,8 @@ def at(turns: float, drives: Sequence[int] = ALL, more: int = 0) -> list[int]:
 def seen(positions: Sequence[int]) -> DriveSnapshot:
     """Drives that hold."""
     words = np.full(len(positions), 0x0217)
-    return DriveSnapshot(np.array(positions), np.zeros(len(positions)), words, (), ())
+    counts = np.array(positions)
+    return DriveSnapshot(counts, np.zeros_like(counts), words, (), ())
 
 
 @pytest.mark.parametrize(
