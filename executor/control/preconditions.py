@@ -14,8 +14,8 @@ from executor.interlock.reference import (
     HomingReference,
     moved_since,
     released_since,
-    turned_drives,
-    why_turned,
+    turns_lost,
+    why_turns_lost,
 )
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.errors import Refused
@@ -132,8 +132,8 @@ def require_still_referenced(
     if reference is None:
         return
     positions = seen.positions.tolist()
-    if turned := why_turned(rig, reference, positions):
-        raise turned_drives(turned, "arming")
+    if lost := why_turns_lost(rig, reference, positions):
+        raise turns_lost(lost, "arming")
     moved = moved_since(rig, reference, positions)
     for drive, (winch, off) in enumerate(zip(rig.winches, moved, strict=True)):
         if not winch.absolute and winch.node_id in restarted:

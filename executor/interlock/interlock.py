@@ -25,9 +25,9 @@ from executor.interlock.reference import (
     referenced,
     released_since,
     require_absolute,
-    turned_drives,
+    turns_lost,
     why_moved,
-    why_turned,
+    why_turns_lost,
 )
 from executor.state_machine import State
 from model.errors import Refused
@@ -86,12 +86,12 @@ class MotionInterlock:
         if positions is None:
             return ""
         moved = "" if reference is None else why_moved(self._rig, reference, positions)
-        return self.why_turned(positions) or moved
+        return self.why_turns_lost(positions) or moved
 
-    def why_turned(self, positions: Sequence[int]) -> str:
+    def why_turns_lost(self, positions: Sequence[int]) -> str:
         """Why the reference is lost, where encoders now at positions [counts] lost whole turns."""
         reference = self._braked_at()
-        return "" if reference is None else why_turned(self._rig, reference, positions)
+        return "" if reference is None else why_turns_lost(self._rig, reference, positions)
 
     def _braked_at(self) -> HomingReference | None:
         """The reference, if brakes should hold the drives at its last positions; else None."""
@@ -137,7 +137,7 @@ class MotionInterlock:
             return None
         if reference is None or reference.lost or len(reference.stands_at) != len(positions):
             return None
-        moved = self.why_turned(positions) or why_moved(self._rig, reference, positions)
+        moved = self.why_turns_lost(positions) or why_moved(self._rig, reference, positions)
         return None if moved else reference
 
     def found_restarted(self, nodes: Iterable[int]) -> None:
@@ -173,7 +173,7 @@ class MotionInterlock:
         Raises:
             Refused: It cannot be written.
         """
-        if why := self.why_turned(positions) or self.why_released(restarted, released):
+        if why := self.why_turns_lost(positions) or self.why_released(restarted, released):
             self._lose(why)
 
     def why_released(self, restarted: Collection[int], released: Collection[int]) -> str:
@@ -407,8 +407,8 @@ class MotionInterlock:
         """
         self.require_free()
         self._require_absolute()
-        if self._braked_at() is not None and (turned := self.why_turned(read_positions())):
-            raise turned_drives(turned, self.file.where)
+        if self._braked_at() is not None and (lost := self.why_turns_lost(read_positions())):
+            raise turns_lost(lost, self.file.where)
 
     def _require_absolute(self) -> None:
         if self._is_kept:
@@ -433,8 +433,8 @@ def reference_status(
             their positions.
     """
     why = interlock.why_unreferenced(positions)
-    turned = positions is not None and bool(interlock.why_turned(positions))
-    unrecorded = held and not turned and bool(why) and not interlock.why_unreferenced()
+    turns = positions is not None and bool(interlock.why_turns_lost(positions))
+    unrecorded = held and not turns and bool(why) and not interlock.why_unreferenced()
     if unrecorded:
         why = (
             f"the end of the last motion was not recorded ({why}), but all drives held:"

@@ -42,7 +42,7 @@ OVER_THE_TRAVEL = f"make the encoders absolute over the whole travel, then {AGAI
 RESTARTED = "power-cycled, or `bus.cycle_ms` was changed"
 
 #: Why encoders that keep their position without power lost their reference.
-TURNED = ("than where its brake held it", "than where their brakes held them")
+BRAKED = ("than where its brake held it", "than where their brakes held them")
 
 #: A brake holds a drum within this part of a motor turn, if not within the start tolerance.
 HELD_TURN = 0.1
@@ -176,19 +176,19 @@ def why_moved(rig: Rig, reference: HomingReference, positions: Sequence[int]) ->
 def is_braked_at(rig: Rig, reference: HomingReference) -> bool:
     """Whether brakes should hold absolute encoders of this rig at the last positions on file.
 
-    Not where cables were released: they may have turned the drums.
+    Not where cables were released: they may have rotated the drums.
     """
     is_of_rig = reference.is_measured and reference.rig_hash == counting_hash(rig)
-    held = not reference.lost or reference.lost.endswith(TURNED)
+    held = not reference.lost or reference.lost.endswith(BRAKED)
     return is_of_rig and held and any(winch.absolute and winch.brake for winch in rig.winches)
 
 
-def why_turned(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> str:
+def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> str:
     """Which absolute encoders count whole turns from where brakes held them; empty if none does.
 
     The brake held the drum, so they lost these turns with their power. Any other distance means
-    that the drum was turned, which they counted. Without a brake the drum may have been turned by
-    whole turns as well as by any other angle.
+    that the drum moved, which they counted. Without a brake it may have moved by whole turns as
+    well as by any other angle.
 
     Args:
         rig: The robot.
@@ -209,7 +209,7 @@ def why_turned(rig: Rig, reference: HomingReference, positions: Sequence[int]) -
     return "; ".join(
         f"{', '.join(names)} {'count' if names[1:] else 'counts'} {abs(turns)} whole"
         f" turn{'s' if abs(turns) > 1 else ''} {'more' if turns > 0 else 'less'}"
-        f" {TURNED[bool(names[1:])]}"
+        f" {BRAKED[bool(names[1:])]}"
         for turns, names in named.items()
     )
 
@@ -359,7 +359,7 @@ def lost_reference(rig: Rig, reference: HomingReference, where: str) -> Refused:
         "the homing reference is lost",
         where=where,
         why=f"{reference.lost}; {homed}",
-        next_step=OVER_THE_TRAVEL if reference.lost.endswith(TURNED) else next_step,
+        next_step=OVER_THE_TRAVEL if reference.lost.endswith(BRAKED) else next_step,
     )
 
 
@@ -373,10 +373,10 @@ def changed_reference(now: HomingReference, where: str) -> Refused:
     )
 
 
-def turned_drives(turned: str, where: str) -> Refused:
-    """Refusal of absolute encoders that lost whole turns; ``turned`` from `why_turned`."""
+def turns_lost(lost: str, where: str) -> Refused:
+    """Refusal of absolute encoders that lost whole turns; ``lost`` from `why_turns_lost`."""
     return Refused(
-        f"the homing reference is lost: {turned}",
+        f"the homing reference is lost: {lost}",
         where=where,
         why="an encoder lost these turns with its power: it is not absolute over the whole travel,"
         " or not set up so (ODrive: absolute_setpoints)",

@@ -19,7 +19,7 @@ from executor.homing import use_rig_file_counts
 from executor.interlock import reference as references
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock, reference_status
-from executor.interlock.reference import HomingReference, reference_at, why_turned
+from executor.interlock.reference import HomingReference, reference_at, why_turns_lost
 from executor.realtime.child import Armed, Ended
 from executor.state_machine import State
 from model.errors import HardwareMissing, Refused
@@ -132,9 +132,9 @@ def test_a_brake_holds_within_the_start_tolerance() -> None:
     most = int(rig.motion.start_tolerance * abs(winch.counts_per_metre))
     assert most < references.HELD_TURN * winch.counts_per_turn
     for off in (most, -most):
-        assert why_turned(rig, reference, at(1, [1], off))
+        assert why_turns_lost(rig, reference, at(1, [1], off))
     for off in (most + 1, -most - 1):
-        assert why_turned(rig, reference, at(1, [1], off)) == ""
+        assert why_turns_lost(rig, reference, at(1, [1], off)) == ""
 
 
 def test_with_a_high_gear_a_brake_holds_within_a_tenth_of_a_turn() -> None:
@@ -144,9 +144,9 @@ def test_with_a_high_gear_a_brake_holds_within_a_tenth_of_a_turn() -> None:
     most = int(references.HELD_TURN * winch.counts_per_turn)
     assert most < rig.motion.start_tolerance * abs(winch.counts_per_metre)
     for off in (most, -most):
-        assert why_turned(rig, reference, at(1, [1], off))
+        assert why_turns_lost(rig, reference, at(1, [1], off))
     for off in (most + 1, -most - 1):
-        assert why_turned(rig, reference, at(1, [1], off)) == ""
+        assert why_turns_lost(rig, reference, at(1, [1], off)) == ""
 
 
 def test_drives_that_were_never_homed_have_a_position_after_their_first_motion() -> None:
@@ -175,7 +175,7 @@ def test_positions_of_another_rig_file_are_not_compared() -> None:
     assert other.still_counts(at(1)) is not None
     kept = interlock.kept_reference()
     assert kept is not None
-    assert why_turned(rig, kept, at(1)[:7]) == ""
+    assert why_turns_lost(rig, kept, at(1)[:7]) == ""
 
 
 class Resetting:
@@ -303,7 +303,7 @@ def test_after_a_release_of_cables_positions_are_not_compared(
     rig = rig_with()
     MotionInterlock(rig).file.write(homed(rig).model_copy(update={"lost": "released"}))
     monkeypatch.setattr(homing, "read_snapshot", lambda *_: seen(at(1)))
-    assert MotionInterlock(rig).why_turned(at(1)) == ""
+    assert MotionInterlock(rig).why_turns_lost(at(1)) == ""
     use_rig_file_counts(rig)
     assert MotionInterlock(rig).kept_reference() is None
 
