@@ -51,7 +51,7 @@ SENT_CYCLICALLY = ("its version_msg_rate_ms is not 0", "set version_msg_rate_ms 
 
 OPCODE_READ, OPCODE_WRITE = 0, 1
 
-LISTENING_TRIES = 3  # as this computer may be late
+LISTENING_TRIES = 5  # as this computer may be late
 
 PUMPED = 0.01
 """Time counted for each step of simulated drives, [s]."""

@@ -402,6 +402,7 @@ def passing(bench: OdriveBench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pas
         yield bus
 
 
+@pytest.mark.parametrize("period", [0.02, 0.1])
 @pytest.mark.parametrize(
     ("kind", "text", "setting"),
     [
@@ -414,11 +415,11 @@ def passing(bench: OdriveBench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pas
     ],
 )
 def test_a_message_period_longer_than_in_the_rig_file_is_refused_before_anything_is_enabled(
-    bench: OdriveBench, passing: PassingTime, kind: str, text: str, setting: str
+    bench: OdriveBench, passing: PassingTime, period: float, kind: str, text: str, setting: str
 ) -> None:
     """All were enabled, and 0.1 s later one "did not report its torque"."""
     passing.configure(bench)
-    setattr(bench.drives[3].settings, kind, 0.1)
+    setattr(bench.drives[3].settings, kind, period)
     bench.frames()
     with pytest.raises(HardwareMissing, match=text) as caught:
         passing.configure(bench)
@@ -428,7 +429,7 @@ def test_a_message_period_longer_than_in_the_rig_file_is_refused_before_anything
     assert SET_AXIS_STATE not in commands
 
 
-@pytest.mark.parametrize(("late", "accepted"), [(2, True), (3, False)])
+@pytest.mark.parametrize(("late", "accepted"), [(4, True), (5, False)])
 def test_message_periods_are_measured_again_where_the_computer_was_late(
     bench: OdriveBench,
     passing: PassingTime,
@@ -452,14 +453,14 @@ def test_message_periods_are_measured_again_where_the_computer_was_late(
     assert len(measured) == (late + 2 if accepted else late)
 
 
-def test_two_messages_of_ten_may_be_lost_while_their_period_is_measured() -> None:
+def test_messages_may_be_late_while_their_period_is_measured() -> None:
     period = "torques_ms", "torques_msg_rate_ms", 20
-    assert too_rare((1, 2), {1: 8, 2: 11}, *period) is None
-    refusal = too_rare((1, 2, 3), {1: 7, 2: 11}, *period)
+    assert too_rare((1, 2), {1: 12, 2: 21}, *period) is None
+    refusal = too_rare((1, 2, 3), {1: 11, 2: 21}, *period)
     assert refusal is not None
     assert refusal.what == (
-        "drives 1, 3: torque less often than every 20 ms (drives.torques_ms), 0 instead of 10 in"
-        " 200 ms"
+        "drives 1, 3: torque less often than every 20 ms (drives.torques_ms), 0 instead of 20 in"
+        " 400 ms"
     )
 
 
