@@ -408,10 +408,10 @@ def passing(bench: OdriveBench, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pas
     [
         (
             "torques",
-            r"drives 4: torque less often than every 10 ms \(drives\.torques_ms\)",
+            r"drive 4: torque less often than every 10 ms \(drives\.torques_ms\)",
             "torques",
         ),
-        ("estimates", r"drives 4: position .* every 10 ms \(drives\.estimates_ms\)", "encoder"),
+        ("estimates", r"drive 4: position .* every 10 ms \(drives\.estimates_ms\)", "encoder"),
     ],
 )
 def test_a_message_period_longer_than_in_the_rig_file_is_refused_before_anything_is_enabled(
