@@ -362,8 +362,8 @@ def too_rare(
     report = "position" if key == "estimates_ms" else "torque"
     least, within = min(heard.get(node, 0) for node in rare), LISTENED * period_ms
     return HardwareMissing(
-        f"drive{'s' if rare[1:] else ''} {names}: {report} less often than every {period_ms:g} ms (drives.{key}),"
-        f" {least} instead of {LISTENED} in {within:g} ms",
+        f"drive{'s' if rare[1:] else ''} {names}: {report} less often than every {period_ms:g} ms"
+        f" (drives.{key}), {least} instead of {LISTENED} in {within:g} ms",
         where=SETTING_UP,
         why="it is sent with another period or not at all, or frames are lost",
         next_step=f"set {setting} of every drive to drives.{key}",
