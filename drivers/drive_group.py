@@ -178,7 +178,6 @@ class DriveSnapshot:
         torques: Positive when winding in, shape (n,), [per mille of rated torque].
         status_words: Shape (n,); see `drive_states`.
         restarted: Nodes without this program's configuration: power-cycled, or never configured.
-            For drives with non-volatile settings, all without an absolute encoder.
         errors: The error that each drive in fault stores, or why one at rest cannot be enabled, as
             text; empty without one, and for drives that show it in their state.
         silent: Nodes that did not answer; only of a partial reading.

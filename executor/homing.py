@@ -23,7 +23,7 @@ from executor.cameras.sources import (
 from executor.control.winch_laws import PretensionLaw, wind_in_speed
 from executor.control.winch_loop import MakeLaw
 from executor.control.winch_motion import WinchResult
-from executor.drives import is_simulated, require_drives
+from executor.drives import is_simulated, read_snapshot, require_drives
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, reference_at
 from executor.proposals import Facts, Proposal, forget_proposal, homing_proposal, require_confirmed
@@ -46,7 +46,7 @@ from model.pages.page import FactsDisplay
 from model.pose import Array, Pose
 from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
-from model.scene import require_unaltered
+from model.scene import empty_scene, require_unaltered
 from model.statics.gravity import working_tensions
 from model.winches import whole_lengths
 from planner.settings import whole_number
@@ -209,12 +209,18 @@ def use_rig_file_counts(rig: Rig, *, confirm: Callable[[Proposal], bool] | None 
     """Discards the reference: absolute encoders count as in the rig file. Moves nothing.
 
     Raises:
-        Refused: The bus is latched, or not all encoders are absolute.
+        Refused: The bus is latched, not all encoders are absolute, or one lost whole turns.
         StoppedByOperator: Cancelled.
+        CdprError: Drives with brakes, whose last positions are known, cannot be read.
     """
     require_imported_script()
     interlock = MotionInterlock(rig)
-    interlock.require_rig_file_counts()
+
+    def read_positions() -> list[int]:
+        seen = read_snapshot(rig, rig.home, empty_scene(rig).load)
+        return [int(position) for position in seen.positions]
+
+    interlock.require_rig_file_counts(read_positions)
     require_confirmed(confirm, forget_proposal(interlock))
     interlock.use_rig_file_counts()
 

@@ -142,7 +142,7 @@ class StatusResult(FactsDisplay):
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
         if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
             steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")
-        if self.reference.known and not (self.reference.counts or self.reference.valid_after_reset):
+        if self.reference.why_lost is not None:
             steps.append(f"cdpr home {file} with {HOMING_OPTIONS}")
         return "; then ".join(steps)
 

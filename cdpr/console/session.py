@@ -160,7 +160,7 @@ class Console:
             "simulated": is_simulated(rig),
             "homes_by": without_passwords(self.files.cameras[0]) if self.files.cameras else None,
             "home_mm": np.round(1e3 * rig.home.position, 3).tolist(),
-            **stored_state(self._stored),
+            **stored_state(self._stored, seen.why_lost),
             "busy": busy_state(verb, self._line, self.plan.loading),
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},

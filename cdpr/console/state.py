@@ -141,9 +141,15 @@ class StoredState:
     moved_by: int | None = None
 
 
-def stored_state(stored: StoredState) -> dict[str, Any]:
-    """The fault latch, a motion of another user, and the homing reference."""
-    reference = {"counts": stored.referenced, "why_not": stored.why_not}
+def stored_state(stored: StoredState, why_lost: str | None) -> dict[str, Any]:
+    """The fault latch, a motion of another user, and the homing reference.
+
+    Args:
+        stored: From their files.
+        why_lost: Why the drives, as read, must be homed.
+    """
+    why_not = stored.why_not or why_lost
+    reference = {"counts": stored.referenced and not why_not, "why_not": why_not}
     return {"latched": stored.latched, "moved_by": stored.moved_by, "reference": reference}
 
 

@@ -225,12 +225,14 @@ class RobotReport:
         tensions: [N]; None if unknown, as for a drive without torque.
         at: ISO time of these values if nothing watches the drives; None while a run reports.
         why_not: Why some of it is unknown, or older than the last attempt to read it.
+        why_lost: Why the drives, as read, must be homed.
     """
 
     robot: RobotNow | None
     tensions: list[float | None] | None
     at: str | None = None
     why_not: str | None = None
+    why_lost: str | None = None
 
     def as_dict(self) -> dict[str, Any] | None:
         """Data for the page on values that are not live or incomplete; None if live."""
@@ -351,12 +353,12 @@ class RobotWatch:
                 self._due = time.monotonic() + USED_FOR
                 seen = replace(self.now, why_not="another program uses the drives")
             else:
-                why_not = result.why_no_pose or result.reference.why_not
+                robot, reference = self._view.at_rest(result), result.reference
+                why_not = result.why_no_pose or reference.why_not
                 tensions = [
                     round(drive.tension, 2) if drive.has_torque else None for drive in result.drives
                 ]
-                robot = self._view.at_rest(result)
-                seen = RobotReport(robot, tensions, _local_time(), why_not)
+                seen = RobotReport(robot, tensions, _local_time(), why_not, reference.why_lost)
         with self._lock:
             self.now = seen
 

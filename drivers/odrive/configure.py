@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -24,19 +25,13 @@ from drivers.odrive.messages import (
     Layouts,
     can_id,
     commanding_ids,
-    error_text,
     foreign_master_message,
     is_command,
     node_and_command,
 )
+from drivers.odrive.monitor import LISTENED, in_error, no_version, not_idle, too_rare
 from drivers.plausibility import position_limits
-from drivers.setup_refusals import (
-    SETTING_UP,
-    answers_twice,
-    in_fault,
-    moved_by_another,
-    wrong_setting,
-)
+from drivers.setup_refusals import SETTING_UP, answers_twice, wrong_setting
 from model.errors import BadInput, HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
@@ -55,6 +50,8 @@ SENT_CYCLICALLY = ("its version_msg_rate_ms is not 0", "set version_msg_rate_ms 
 """Another cause of two version messages, and its cure."""
 
 OPCODE_READ, OPCODE_WRITE = 0, 1
+
+LISTENING_TRIES = 5  # as this computer may be late
 
 PUMPED = 0.01
 """Time counted for each step of simulated drives, [s]."""
@@ -193,6 +190,8 @@ def configure_drives(
     _check_versions(link, layouts, nodes, document, known)
     _check_idle(link, layouts, nodes, document, to_reset)
     _check_supply(link, layouts, nodes)
+    if pump is None:  # drives simulated in this process have the periods of the rig file
+        _check_rates(link, layouts, nodes, document)
     if known is not None:
         for node in nodes:
             for wanted in wanted_settings(document, layouts):
@@ -318,7 +317,7 @@ def _answers(
     missing = [node for node in nodes if node not in received]
     silent = ", ".join(map(str, missing))
     if there.issuperset(missing):
-        raise _no_version(silent)
+        raise no_version(silent)
     adapter = ", or an adapter without remote frames" if asked else ""
     raise HardwareMissing(
         f"drive{'s' if ',' in silent else ''} {silent}: no {layout.name}",
@@ -328,17 +327,6 @@ def _answers(
         next_step="check power and wiring, and node id, bit rate and message periods with"
         " odrivetool",
         values={"nodes": silent},
-    )
-
-
-def _no_version(nodes: str) -> HardwareMissing:
-    return HardwareMissing(
-        f"drive{'s' if ',' in nodes else ''} {nodes}: heartbeats, but no Get_Version",
-        where=SETTING_UP,
-        why="firmware 0.5, which every ODrive 3.x has, or an adapter without remote frames",
-        next_step="use ODrive Pro, S1 or Micro, as 3.x has no firmware 0.6; if these are in use,"
-        " check the adapter",
-        values={"nodes": nodes},
     )
 
 
@@ -375,18 +363,15 @@ def _check_versions(
 def _check_idle(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], document: OdriveDocument, reset: bool
 ) -> None:
-    """Checks that no drive is enabled or busy; another program controls an enabled one."""
+    """Checks that no drive is enabled, busy or in error."""
     wait = heartbeat_within(document)
     heartbeats = _answers(link, layouts.heartbeat, nodes, wait, asked=False)
     for node, (_, state, _) in heartbeats.items():
         if state != AxisState.IDLE:
-            enabled = state == AxisState.CLOSED_LOOP_CONTROL
-            what = "already enabled" if enabled else f"in axis state {state}"
-            raise moved_by_another(node, what, "Heartbeat")
+            raise not_idle(node, int(state))
     for node, (errors, _, _) in heartbeats.items():
         if int(errors) & ~AxisError.WATCHDOG_TIMER_EXPIRED and not reset:
-            why = "it disarmed itself; its brake holds the cable"
-            raise in_fault(node, f": {error_text(int(errors))}", "Heartbeat", why)
+            raise in_error(node, int(errors))
     if any(errors == AxisError.WATCHDOG_TIMER_EXPIRED for errors, _, _ in heartbeats.values()):
         for node in nodes:
             link.send(node, layouts.clear_errors, 0)
@@ -405,6 +390,28 @@ def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> No
                 next_step="switch on the motor supply",
                 values={"node": node, "voltage": voltage},
             )
+
+
+def _check_rates(
+    link: SetupLink, layouts: Layouts, nodes: Sequence[int], document: OdriveDocument
+) -> None:
+    """Checks that positions and torques are as frequent as in the rig file.
+
+    Raises:
+        HardwareMissing: They are rarer.
+    """
+    for key, setting, layout in (
+        ("estimates_ms", "encoder_msg_rate_ms", layouts.get_encoder_estimates),
+        ("torques_ms", "torques_msg_rate_ms", layouts.get_torques),
+    ):
+        period = getattr(document, key)
+        for left in reversed(range(LISTENING_TRIES)):
+            answers = link.answers(layout, LISTENED * period / 1000.0)
+            rare = too_rare(nodes, Counter(node for node, _ in answers), key, setting, period)
+            if rare is None:
+                break
+            if not left:
+                raise rare
 
 
 def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wanted: Wanted) -> None:

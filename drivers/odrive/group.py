@@ -124,8 +124,11 @@ class OdriveGroup(CyclicGroup):
 
     @property
     def restarted(self) -> tuple[int, ...]:
-        """All nodes without an absolute encoder, as ODrive settings are non-volatile."""
-        return tuple(winch.node_id for winch in self._rig.winches if not winch.absolute)
+        """Empty: a loss of power leaves no trace, as ODrive settings are non-volatile.
+
+        So the rig file requires absolute encoders.
+        """
+        return ()
 
     @property
     def stopping(self) -> bool:
@@ -428,8 +431,7 @@ def read_axes(
         positions=np.array(watch.positions, dtype=np.int64)[heard],
         torques=np.rint(np.array(watch.torques) * per_mille).astype(np.int64)[heard],
         status_words=np.array(watch.status_words, dtype=np.int64)[heard],
-        # Their settings are non-volatile, so a loss of power leaves no trace.
-        restarted=tuple(winch.node_id for winch in rig.winches if not winch.absolute),
+        restarted=(),  # see `OdriveGroup.restarted`
         errors=("",) * int(heard.sum()),
         silent=tuple(np.array(nodes)[~heard].tolist()),
         silence=silence,

@@ -254,12 +254,14 @@ class InputMode(IntEnum):
 class AxisError(IntEnum):
     """Errors that are handled specially."""
 
+    INITIALIZING = 0x0000_0001
+    DC_BUS_UNDER_VOLTAGE = 0x0000_0200
     WATCHDOG_TIMER_EXPIRED = 0x0100_0000
     ESTOP_REQUESTED = 0x0200_0000
 
 
 ERROR_TEXTS: dict[int, str] = {
-    0x0000_0001: "still starting",
+    AxisError.INITIALIZING: "still starting",
     0x0000_0002: "drive electronics",
     0x0000_0004: "control loop late",
     0x0000_0008: "no position from the encoder",
@@ -267,7 +269,7 @@ ERROR_TEXTS: dict[int, str] = {
     0x0000_0020: "gate driver",
     0x0000_0040: "no set-point received",
     0x0000_0100: "supply over-voltage",
-    0x0000_0200: "supply under-voltage",
+    AxisError.DC_BUS_UNDER_VOLTAGE: "supply under-voltage",
     0x0000_0400: "supply over-current",
     0x0000_0800: "regenerated current above its limit",
     0x0000_1000: "motor current above its limit",

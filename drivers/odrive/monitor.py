@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Literal
 
 from drivers.can_load import HEARTBEATS_WAITED
@@ -17,7 +17,8 @@ from drivers.odrive.messages import (
     status_word,
 )
 from drivers.plausibility import ReplyCheck
-from model.errors import HardwareMissing
+from drivers.setup_refusals import SETTING_UP, in_fault, moved_by_another
+from model.errors import HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig
 
@@ -293,3 +294,78 @@ class OdriveMonitor:
         self._not_numbers.add((report, drive))
         self._check.reject(drive, f"its {report} is not a number")
         return False
+
+
+# Refusals during set-up, by what the drives report.
+
+
+def no_version(nodes: str) -> HardwareMissing:
+    """Refusal of drives that do not answer a request for their version."""
+    return HardwareMissing(
+        f"drive{'s' if ',' in nodes else ''} {nodes}: heartbeats, but no Get_Version",
+        where=SETTING_UP,
+        why="firmware 0.5, which every ODrive 3.x has, or an adapter without remote frames",
+        next_step="use ODrive Pro, S1 or Micro, as 3.x has no firmware 0.6; if these are in use,"
+        " check the adapter",
+        values={"nodes": nodes},
+    )
+
+
+def not_idle(node: int, state: int) -> Refused:
+    """Refusal of a drive whose axis is in another state."""
+    if state == AxisState.CLOSED_LOOP_CONTROL:
+        return moved_by_another(node, "already enabled", "Heartbeat")
+    return Refused(
+        f"drive {node} is in axis state {state}",
+        where=f"drive {node}, Heartbeat",
+        why="it starts, calibrates or homes by its own settings (axis0.config.startup_*), or"
+        " another program asked for it",
+        next_step="wait until it is idle, and set all axis0.config.startup_* to False; or end the"
+        " other program",
+        values={"node": node},
+    )
+
+
+def in_error(node: int, errors: int) -> Refused:
+    """Refusal of an idle drive with errors."""
+    why = "it disarmed itself; its brake holds the cable"
+    if errors & AxisError.DC_BUS_UNDER_VOLTAGE:
+        why = "its motor supply is off or too low, or was while it was enabled; its brake holds"
+    elif errors & AxisError.INITIALIZING:
+        why = "it was switched on or restarted just now, or its electronics failed to start"
+    return in_fault(node, f": {error_text(errors)}", "Heartbeat", why)
+
+
+LISTENED = 20
+"""Messages of a kind that a drive sends while its period is checked."""
+
+LEAST_HEARD = 0.6
+"""Part of them below which its period is longer; a computer may be late, real or simulating."""
+
+
+def too_rare(
+    nodes: Sequence[int], heard: Mapping[int, int], key: str, setting: str, period_ms: float
+) -> HardwareMissing | None:
+    """Refusal of drives that sent a message less often than in the rig file; None if none did.
+
+    Args:
+        nodes: The drives.
+        heard: Messages of each while it should have sent `LISTENED`, by node.
+        key: Of the period in the rig file.
+        setting: Of the period in the drive.
+        period_ms: In the rig file, [ms].
+    """
+    rare = [node for node in nodes if heard.get(node, 0) < LEAST_HEARD * LISTENED]
+    if not rare:
+        return None
+    names = ", ".join(map(str, rare))
+    report = "position" if key == "estimates_ms" else "torque"
+    least, within = min(heard.get(node, 0) for node in rare), LISTENED * period_ms
+    return HardwareMissing(
+        f"drive{'s' if rare[1:] else ''} {names}: {report} less often than every {period_ms:g} ms"
+        f" (drives.{key}), {least} instead of {LISTENED} in {within:g} ms",
+        where=SETTING_UP,
+        why="it is sent with another period or not at all, or frames are lost",
+        next_step=f"set {setting} of every drive to drives.{key}",
+        values={"nodes": names},
+    )

@@ -14,6 +14,8 @@ from executor.interlock.reference import (
     HomingReference,
     moved_since,
     released_since,
+    turns_lost,
+    why_turns_lost,
 )
 from executor.trajectory.setpoints import CheckedSetpoints
 from model.errors import Refused
@@ -114,8 +116,9 @@ def require_still_referenced(
     """Requires the drives to have kept their reference.
 
     A drive without an absolute encoder silently loses its configuration and position with its
-    power. So it must still have its configuration, and be at its last known position. Any drive
-    that was left holding its cable must still hold it.
+    power. So it must still have its configuration, and be at its last known position. An absolute
+    one must not count whole turns from where its brake held it. Any drive that was left holding its
+    cable must still hold it.
 
     Args:
         rig: The robot.
@@ -128,7 +131,10 @@ def require_still_referenced(
     """
     if reference is None:
         return
-    moved = moved_since(rig, reference, seen.positions.tolist())
+    positions = seen.positions.tolist()
+    if lost := why_turns_lost(rig, reference, positions):
+        raise turns_lost(lost, "arming")
+    moved = moved_since(rig, reference, positions)
     for drive, (winch, off) in enumerate(zip(rig.winches, moved, strict=True)):
         if not winch.absolute and winch.node_id in restarted:
             raise _lost(rig, drive, f"it was {RESTARTED}")

@@ -320,7 +320,7 @@ def release_drives(
     record = interlock.file.path.parent
     armed = process.arm(Unrecorded())
     on_armed(armed.denied)
-    interlock.found_released(armed.restarted, armed.released)
+    interlock.found_at_rest(armed.positions, armed.restarted, armed.released)
     interlock.begin(record, interlock.still_counts(armed.positions), under=under)
     ended, left, released = _CUT_SHORT, None, False
     try:
@@ -365,7 +365,7 @@ def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> Drives
     """Resets drives in fault; those that hold keep holding.
 
     If all held throughout, as after a program was killed, their reference remains valid at their
-    present positions.
+    present positions; so does that of absolute encoders which lost no turns.
 
     Args:
         interlock: Of their rig.
@@ -379,7 +379,7 @@ def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> Drives
     if ended.state is not State.FINISHED:
         raise ended.error or Fault(ended.cause, where="reset")
     left = process.read_status()
-    interlock.found_released(armed.restarted, armed.released)
-    if ended.holding and not armed.restarted:
-        interlock.confirm_held(left.positions.tolist())
+    interlock.found_at_rest(armed.positions, armed.restarted, armed.released)
+    held = ended.holding and not armed.restarted
+    interlock.confirm_at_rest(left.positions.tolist(), held=held)
     return DrivesReset(left, armed.restarted)

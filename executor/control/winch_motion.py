@@ -153,7 +153,7 @@ def move_winches(
     armed = mover.arm(last)
     if armed.denied:
         last.take_event(LoopEvent(0, 0.0, "no_real_time", armed.denied))
-    interlock.found_released(armed.restarted, armed.released)
+    interlock.found_at_rest(armed.positions, armed.restarted, armed.released)
     interlock.begin(record, interlock.still_counts(armed.positions), rehome=rehome)
     ended, found = _CUT_SHORT, None
     try:

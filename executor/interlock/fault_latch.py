@@ -125,6 +125,11 @@ class FaultLatch:
         is_of_motion = _DURING_FAULT not in held and holder in (0, latched.process)
         return (None if is_of_motion else latched), holder or latched.process
 
+    def is_of_unfinished_motion(self) -> bool:
+        """Whether a motion is in progress, or its program was killed: where it ended is unknown."""
+        latched = self.read()
+        return latched is not None and latched.cause == _CUT_SHORT
+
     def require_disengaged(self) -> None:
         """Requires the latch to be disengaged.
 

@@ -6,23 +6,28 @@ the rig file.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 
 from drivers.can_bus import IN_PROCESS, BusSettings
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.reference import (
     AGAIN,
-    AS_IN_THE_FILE,
     RESTARTED,
     HomingReference,
     ReferenceFile,
     ReferenceStatus,
     as_in_the_file,
+    changed_reference,
     counting_hash,
-    moved_since,
+    is_braked_at,
+    lost_reference,
     referenced,
     released_since,
+    require_absolute,
+    turns_lost,
+    why_moved,
+    why_turns_lost,
 )
 from executor.state_machine import State
 from model.errors import Refused
@@ -59,7 +64,7 @@ class MotionInterlock:
         """
         reference = self.kept_reference()
         if reference is not None and reference.lost:
-            raise self._lost_refusal(reference)
+            raise lost_reference(self._rig, reference, self.file.where)
         if reference is None or not reference.made:
             self._require_absolute()
             return None
@@ -78,14 +83,25 @@ class MotionInterlock:
             reference = self.reference()
         except Refused as error:
             return f"{error.what}: {error.why}"
-        if reference is None or positions is None:
+        if positions is None:
             return ""
-        moved = moved_since(self._rig, reference, positions)
-        worst = max(range(len(moved)), key=moved.__getitem__)
-        if moved[worst] <= self._rig.motion.start_tolerance:
-            return ""
-        name = list(self._rig.drive_names.values())[worst]
-        return f"{name} is {moved[worst] * 1000:.1f} mm of cable from its last known position"
+        moved = "" if reference is None else why_moved(self._rig, reference, positions)
+        return self.why_turns_lost(positions) or moved
+
+    def why_turns_lost(self, positions: Sequence[int]) -> str:
+        """Why the reference is lost, where encoders now at positions [counts] lost whole turns."""
+        reference = self._braked_at()
+        return "" if reference is None else why_turns_lost(self._rig, reference, positions)
+
+    def _braked_at(self) -> HomingReference | None:
+        """The reference, if brakes should hold the drives at its last positions; else None."""
+        try:
+            reference = self._in_force()
+        except Refused:  # refused anyway
+            return None
+        if reference is None or self._latch.is_of_unfinished_motion():
+            return None  # until a reset stores where it ended, the last positions are older
+        return reference if is_braked_at(self._rig, reference) else None
 
     def kept_reference(self) -> HomingReference | None:
         """The reference on file for this bus, valid or not; None without a file."""
@@ -107,7 +123,7 @@ class MotionInterlock:
         if reference is None:
             return None
         if reference.lost:
-            raise self._lost_refusal(reference)
+            raise lost_reference(self._rig, reference, self.file.where)
         if reference.home_counts != [winch.home_counts for winch in self._rig.winches]:
             what = "the run was prepared with a different homing reference"
             raise self._refusal(what, f"the drives were homed {reference.made}")
@@ -121,8 +137,8 @@ class MotionInterlock:
             return None
         if reference is None or reference.lost or len(reference.stands_at) != len(positions):
             return None
-        moved = max(moved_since(self._rig, reference, positions))
-        return reference if moved <= self._rig.motion.start_tolerance else None
+        moved = self.why_turns_lost(positions) or why_moved(self._rig, reference, positions)
+        return None if moved else reference
 
     def found_restarted(self, nodes: Iterable[int]) -> None:
         """Marks the reference of power-cycled drives as lost; absolute encoders need not hold.
@@ -142,17 +158,22 @@ class MotionInterlock:
             released = sorted(found.union(reference.released))
             self.file.write(reference.model_copy(update={"released": released}))
 
-    def found_released(self, restarted: Collection[int], released: Collection[int]) -> None:
-        """Marks the reference as lost if drives left holding are found without torque.
+    def found_at_rest(
+        self, positions: Sequence[int], restarted: Collection[int], released: Collection[int]
+    ) -> None:
+        """Marks the reference as lost if encoders lost turns, or drives left holding their torque.
+
+        This is written at once, as the motion that follows hides the lost turns.
 
         Args:
+            positions: Of the drives, [counts].
             restarted: Nodes found without this program's configuration.
             released: Nodes found without torque.
 
         Raises:
             Refused: It cannot be written.
         """
-        if why := self.why_released(restarted, released):
+        if why := self.why_turns_lost(positions) or self.why_released(restarted, released):
             self._lose(why)
 
     def why_released(self, restarted: Collection[int], released: Collection[int]) -> str:
@@ -176,20 +197,23 @@ class MotionInterlock:
         if self._is_kept:
             self._note_end(why, holding=False, positions=None, released=())
 
-    def confirm_held(self, positions: Sequence[int]) -> None:
-        """Stores the positions [counts] of drives that held throughout: the reference stays valid.
+    def confirm_at_rest(self, positions: Sequence[int], *, held: bool) -> None:
+        """Stores the positions of drives after a reset: the reference stays valid.
+
+        Args:
+            positions: Of the drives, [counts].
+            held: All held throughout; otherwise only absolute encoders, which count all motion.
 
         Raises:
             Refused: It cannot be written.
         """
         reference = self._readable()
-        if (
-            reference is not None
-            and not reference.lost
-            and len(reference.stands_at) == len(positions)
-        ):
-            update = {"stands_at": list(positions), "released": []}
-            self.file.write(reference.model_copy(update=update))
+        if reference is None or reference.lost or len(reference.stands_at) != len(positions):
+            return
+        rows = zip(self._rig.winches, positions, reference.stands_at, strict=True)
+        at = [now if held or winch.absolute else then for winch, now, then in rows]
+        released = [] if held else reference.released
+        self.file.write(reference.model_copy(update={"stands_at": at, "released": released}))
 
     def begin(
         self,
@@ -240,14 +264,9 @@ class MotionInterlock:
         now = self._readable() if reference is None else self._in_force()
         if reference is not None and now is not None:
             if now.lost:
-                raise self._lost_refusal(now)
+                raise lost_reference(self._rig, now, self.file.where)
             if (now.made, now.home_counts) != (reference.made, reference.home_counts):
-                raise Refused(
-                    "the homing reference changed while this motion was prepared",
-                    where=f"reference {self.file.path}",
-                    why=f"another program homed the drives or discarded their reference: {now.how}",
-                    next_step="prepare the motion again: repeat the command; nothing was moved",
-                )
+                raise changed_reference(now, self.file.where)
         if now is not None and now.released and not now.lost:
             self.file.write(now.model_copy(update={"released": []}))
         return None if reference is None else now
@@ -346,7 +365,8 @@ class MotionInterlock:
         reference = as_in_the_file(self._rig)
         if kept is None:
             return reference
-        return reference.model_copy(update={"released": kept.released})
+        at = {"stands_at": kept.stands_at} if kept.rig_hash == reference.rig_hash else {}
+        return reference.model_copy(update={"released": kept.released} | at)
 
     def _lose(self, why: str) -> None:
         """Marks the reference as lost, also one only another user has; keeps the first reason."""
@@ -370,41 +390,32 @@ class MotionInterlock:
         Raises:
             Refused: A drive without absolute encoder cannot do so; or a fault is latched.
         """
-        self.require_rig_file_counts()
+        self.require_free()
+        self._require_absolute()
         self.file.remove()
 
-    def require_rig_file_counts(self) -> None:
+    def require_rig_file_counts(self, read_positions: Callable[[], Sequence[int]]) -> None:
         """Requires a free bus and absolute encoders, which can count as in the rig file.
 
+        Args:
+            read_positions: Positions of the drives, [counts]; called only where their brakes should
+                have held them at known ones.
+
         Raises:
-            Refused: As `use_rig_file_counts`.
+            Refused: As `use_rig_file_counts`; or an encoder lost whole turns.
+            CdprError: The drives cannot be read.
         """
         self.require_free()
         self._require_absolute()
+        if self._braked_at() is not None and (lost := self.why_turns_lost(read_positions())):
+            raise turns_lost(lost, self.file.where)
 
     def _require_absolute(self) -> None:
-        if not self._is_kept:
-            return
-        names = self._rig.drive_names
-        relative = [names[w.node_id] for w in self._rig.winches if not w.absolute]
-        if relative:
-            raise self._refusal(
-                f"never homed: {', '.join(relative)}",
-                "the position of an encoder that is not absolute (winches[].encoder in the"
-                " rig file) is arbitrary after power-up",
-            )
+        if self._is_kept:
+            require_absolute(self._rig, self.file.where)
 
-    def _lost_refusal(self, reference: HomingReference) -> Refused:
-        homed = f"homed {reference.made}" if reference.made else "the drives were never homed"
-        absolute = all(winch.absolute for winch in self._rig.winches)
-        return self._refusal(
-            "the homing reference is lost",
-            f"{reference.lost}; {homed}",
-            f"{AGAIN}; {AS_IN_THE_FILE}" if absolute else AGAIN,
-        )
-
-    def _refusal(self, what: str, why: str, next_step: str = AGAIN) -> Refused:
-        return Refused(what, where=f"reference {self.file.path}", why=why, next_step=next_step)
+    def _refusal(self, what: str, why: str) -> Refused:
+        return Refused(what, where=self.file.where, why=why, next_step=AGAIN)
 
 
 # Status of a bus's reference.
@@ -422,7 +433,8 @@ def reference_status(
             their positions.
     """
     why = interlock.why_unreferenced(positions)
-    unrecorded = held and bool(why) and not interlock.why_unreferenced()
+    turns = positions is not None and bool(interlock.why_turns_lost(positions))
+    unrecorded = held and not turns and bool(why) and not interlock.why_unreferenced()
     if unrecorded:
         why = (
             f"the end of the last motion was not recorded ({why}), but all drives held:"
@@ -432,12 +444,4 @@ def reference_status(
         kept = interlock.kept_reference()
     except Refused:  # reported in `why`
         kept = None
-    path = interlock.file.path
-    return ReferenceStatus(
-        counts=not why,
-        why_not=why or None,
-        made=kept.made if kept and kept.made else None,
-        how=kept.how if kept and kept.made else None,
-        file=str(path) if path.exists() else None,
-        valid_after_reset=unrecorded,
-    )
+    return ReferenceStatus.of(kept, interlock.file.path, why, valid_after_reset=unrecorded)

@@ -35,8 +35,17 @@ AGAIN = f"home the drives: {HOME}; nothing was moved"
 #: Besides, for absolute encoders.
 AS_IN_THE_FILE = "if they count as in the rig file, `cdpr home RIG --as-rig-file` instead"
 
+#: Next step where encoders lost whole turns.
+OVER_THE_TRAVEL = f"make the encoders absolute over the whole travel, then {AGAIN}"
+
 #: Why a drive lost its configuration, and with it the reference of an incremental encoder.
 RESTARTED = "power-cycled, or `bus.cycle_ms` was changed"
+
+#: Why encoders that keep their position without power lost their reference.
+BRAKED = ("than where its brake held it", "than where their brakes held them")
+
+#: A brake holds a drum within this part of a motor turn, if not within the start tolerance.
+HELD_TURN = 0.1
 
 #: Why drives at rest lost their reference, though they kept their power and position.
 RELEASED = "left holding by the last motion, but without torque now, as after an emergency stop"
@@ -61,6 +70,11 @@ class HomingReference(Document):
         default=[], description="nodes left without torque on purpose, or since power-up"
     )
     lost: str = Field(default="", description="why it is no longer valid")
+
+    @property
+    def is_measured(self) -> bool:
+        """Whether drives were at `stands_at`: absolute encoders never homed have not moved yet."""
+        return bool(self.made) or self.stands_at != self.home_counts
 
 
 def reference_at(
@@ -143,6 +157,63 @@ def moved_since(rig: Rig, reference: HomingReference, positions: Sequence[int]) 
     ]
 
 
+def why_moved(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> str:
+    """Which drive moved farthest since the last motion, and by how much; empty within tolerance.
+
+    Args:
+        rig: The robot.
+        reference: Of its drives.
+        positions: Of the drives now, [counts].
+    """
+    moved = moved_since(rig, reference, positions)
+    worst = max(range(len(moved)), key=moved.__getitem__)
+    if moved[worst] <= rig.motion.start_tolerance:
+        return ""
+    name = list(rig.drive_names.values())[worst]
+    return f"{name} is {moved[worst] * 1000:.1f} mm of cable from its last known position"
+
+
+def is_braked_at(rig: Rig, reference: HomingReference) -> bool:
+    """Whether brakes should hold absolute encoders of this rig at the last positions on file.
+
+    Not where cables were released: they may have rotated the drums.
+    """
+    is_of_rig = reference.is_measured and reference.rig_hash == counting_hash(rig)
+    held = not reference.lost or reference.lost.endswith(BRAKED)
+    return is_of_rig and held and any(winch.absolute and winch.brake for winch in rig.winches)
+
+
+def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> str:
+    """Which absolute encoders count whole turns from where brakes held them; empty if none does.
+
+    The brake held the drum, so they lost these turns with their power. Any other distance means
+    that the drum moved, which they counted. Without a brake it may have moved by whole turns as
+    well as by any other angle.
+
+    Args:
+        rig: The robot.
+        reference: Of its drives; they were not moved by a program since `stands_at`.
+        positions: Of the drives now, [counts].
+    """
+    if not reference.is_measured or len(positions) != len(reference.stands_at):
+        return ""
+    named: dict[int, list[str]] = {}
+    names, left = rig.drive_names.values(), reference.stands_at
+    for name, winch, now, then in zip(names, rig.winches, positions, left, strict=True):
+        turns = round((now - then) / winch.counts_per_turn)
+        off = abs(now - then - turns * winch.counts_per_turn)
+        tolerance = rig.motion.start_tolerance * abs(winch.counts_per_metre)
+        held = off <= min(tolerance, HELD_TURN * winch.counts_per_turn)
+        if winch.absolute and winch.brake and turns and held:
+            named.setdefault(turns, []).append(name)
+    return "; ".join(
+        f"{', '.join(names)} {'count' if names[1:] else 'counts'} {abs(turns)} whole"
+        f" turn{'s' if abs(turns) > 1 else ''} {'more' if turns > 0 else 'less'}"
+        f" {BRAKED[bool(names[1:])]}"
+        for turns, names in named.items()
+    )
+
+
 def released_since(
     rig: Rig, reference: HomingReference, restarted: Collection[int], released: Collection[int]
 ) -> str:
@@ -177,6 +248,11 @@ class ReferenceFile:
     def path(self) -> Path:
         """The file; where there is none, the one that would be written."""
         return next(filter(os.path.lexists, self._paths), self._paths[0])
+
+    @property
+    def where(self) -> str:
+        """The file, in a refusal."""
+        return f"reference {self.path}"
 
     def read(self) -> HomingReference | None:
         """The reference; None where there is none.
@@ -254,6 +330,60 @@ def _origin(reference: HomingReference) -> tuple[str, str, list[int]]:
     return reference.rig_hash, reference.made, reference.home_counts
 
 
+# Refusals, of the rig's drives and of the file.
+
+
+def require_absolute(rig: Rig, where: str) -> None:
+    """Requires absolute encoders of drives that were never homed.
+
+    Raises:
+        Refused: One is not absolute.
+    """
+    relative = [rig.drive_names[winch.node_id] for winch in rig.winches if not winch.absolute]
+    if relative:
+        raise Refused(
+            f"never homed: {', '.join(relative)}",
+            where=where,
+            why="the position of an encoder that is not absolute (winches[].encoder in the rig"
+            " file) is arbitrary after power-up",
+            next_step=AGAIN,
+        )
+
+
+def lost_reference(rig: Rig, reference: HomingReference, where: str) -> Refused:
+    """Refusal of a reference that its file states as lost."""
+    homed = f"homed {reference.made}" if reference.made else "the drives were never homed"
+    absolute = all(winch.absolute for winch in rig.winches)
+    next_step = f"{AGAIN}; {AS_IN_THE_FILE}" if absolute else AGAIN
+    return Refused(
+        "the homing reference is lost",
+        where=where,
+        why=f"{reference.lost}; {homed}",
+        next_step=OVER_THE_TRAVEL if reference.lost.endswith(BRAKED) else next_step,
+    )
+
+
+def changed_reference(now: HomingReference, where: str) -> Refused:
+    """Refusal of a motion prepared with another reference than the present one."""
+    return Refused(
+        "the homing reference changed while this motion was prepared",
+        where=where,
+        why=f"another program homed the drives or discarded their reference: {now.how}",
+        next_step="prepare the motion again: repeat the command; nothing was moved",
+    )
+
+
+def turns_lost(lost: str, where: str) -> Refused:
+    """Refusal of absolute encoders that lost whole turns; ``lost`` from `why_turns_lost`."""
+    return Refused(
+        f"the homing reference is lost: {lost}",
+        where=where,
+        why="an encoder lost these turns with its power: it is not absolute over the whole travel,"
+        " or not set up so (ODrive: absolute_setpoints)",
+        next_step=OVER_THE_TRAVEL,
+    )
+
+
 # Status of a reference, for operators and scripts.
 
 
@@ -279,6 +409,25 @@ class ReferenceStatus:
     file: str | None
     known: bool = True
     valid_after_reset: bool = False
+
+    @classmethod
+    def of(
+        cls, kept: HomingReference | None, path: Path, why: str, *, valid_after_reset: bool
+    ) -> ReferenceStatus:
+        """That of a reference on file, which is not valid because of ``why``, if not empty."""
+        return cls(
+            counts=not why,
+            why_not=why or None,
+            made=kept.made if kept and kept.made else None,
+            how=kept.how if kept and kept.made else None,
+            file=str(path) if path.exists() else None,
+            valid_after_reset=valid_after_reset,
+        )
+
+    @property
+    def why_lost(self) -> str | None:
+        """Why drives must be homed; None if they need not be, or if that is unknown."""
+        return self.why_not if self.known and not self.valid_after_reset else None
 
     def if_unread(self, why: str) -> ReferenceStatus:
         """The same, where not all drives could be read: unknown, unless lost by its file."""

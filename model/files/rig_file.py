@@ -260,7 +260,7 @@ class RigDocument(Document):
             self._a_winch_each,
             self._a_pulley_each,
             self._nodes_once,
-            self._nodes_of_odrives,
+            self._winches_of_odrives,
             self._tags_once,
             self._tags_of_the_family,
             self._cameras_once,
@@ -360,15 +360,15 @@ class RigDocument(Document):
         nodes = [(("winches", i, "node_id"), w.node_id) for i, w in enumerate(self.winches)]
         return _repeated("node_id", nodes)
 
-    def _nodes_of_odrives(self) -> list[Finding]:
+    def _winches_of_odrives(self) -> list[Finding]:
         if self.drives.type != "odrive":
             return []
-        what = f"an ODrive of a rig has a node id from 1 to {ODRIVE_LAST_NODE}"
-        return [
-            (("winches", i, "node_id"), what)
-            for i, winch in enumerate(self.winches)
-            if winch.node_id > ODRIVE_LAST_NODE
-        ]
+        node = f"an ODrive of a rig has a node id from 1 to {ODRIVE_LAST_NODE}"
+        encoder = "an ODrive shows no loss of power: its encoder must be absolute over the travel"
+        winches = list(enumerate(self.winches))
+        wrong = [(i, "node_id", node) for i, winch in winches if winch.node_id > ODRIVE_LAST_NODE]
+        wrong += [(i, "encoder", encoder) for i, winch in winches if winch.encoder != "absolute"]
+        return [(("winches", i, key), what) for i, key, what in wrong]
 
     def _tags_once(self) -> list[Finding]:
         return [] if self.tags is None else _repeated("tag id", self.tags.ids())

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import chdtr
 
-from cdpr.console.state import jog_state
+from cdpr.console.state import StoredState, jog_state, stored_state
 from cdpr.console.view import (
     ELLIPSOID_SCALE,
     RobotNow,
@@ -235,6 +235,30 @@ def test_what_is_not_read_at_rest_is_not_shown_as_known(
     with pytest.raises(Refused, match="pose is not known"):
         drives.watch.pose(None)
     assert drives.watch.pose_at_rest() is None
+
+
+def test_a_reference_that_the_drives_lost_is_not_valid_whatever_its_file_states() -> None:
+    """Encoders lost whole turns: the page showed homed drives, and its buttons refused."""
+    drives, valid = Drives(), StoredState(None, True, None)
+    drives.rest()
+    assert drives.watch.now.why_lost is None
+    assert stored_state(valid, None)["reference"] == {"counts": True, "why_not": None}
+    drives.reading = RELEASED
+    drives.watch.ask()
+    drives.rest()
+    lost = {"counts": False, "why_not": "released"}
+    assert stored_state(valid, drives.watch.now.why_lost)["reference"] == lost
+    noted = StoredState(None, False, "noted")
+    assert stored_state(noted, "released")["reference"] == {"counts": False, "why_not": "noted"}
+    unread = ReferenceStatus(counts=True, why_not=None, made="", how="jig", file="")
+    for reference in (
+        replace(RELEASED.reference, valid_after_reset=True),
+        unread.if_unread("drive 3 does not answer"),
+    ):
+        drives.reading = replace(RELEASED, reference=reference)
+        drives.watch.ask()
+        drives.rest()
+        assert drives.watch.now.why_lost is None, "homing is not the next step"
 
 
 def test_a_run_whose_cables_fit_no_pose_keeps_no_old_one() -> None:

@@ -207,7 +207,7 @@ def test_drives_that_are_found_switched_on_lose_it_for_good() -> None:
     assert interlock.still_counts(found.stands_at) is None
     interlock.begin(Path("run"), None)
     interlock.end(State.FINISHED, "", Path("run"), holding=True, positions=range(8))
-    interlock.confirm_held(range(8))
+    interlock.confirm_at_rest(range(8), held=True)
     assert interlock.kept_reference() == found, "no motion and no reset brings it back"
     absolute = MotionInterlock(rig_with("absolute"))
     left = reference_of(rig)
@@ -275,7 +275,7 @@ def test_drives_that_held_after_a_killed_program_still_count() -> None:
     rig = rig_with("incremental")
     interlock = MotionInterlock(rig)
     interlock.file.write(reference_of(rig))
-    interlock.confirm_held(range(8))
+    interlock.confirm_at_rest(range(8), held=True)
     kept = interlock.kept_reference()
     assert kept is not None
     assert (kept.stands_at, kept.lost) == (list(range(8)), "")
@@ -454,7 +454,7 @@ def test_drives_released_behind_their_brakes_need_not_hold_until_they_are_enable
     _end(interlock, released=ALL, positions=released.positions.tolist())  # never enabled
     still_referenced()
     interlock.begin(Path("run"), interlock.require_ready())  # killed: they may have been enabled
-    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    MotionInterlock(rig).found_at_rest((), (), ALL)  # as a reset finds them
     with pytest.raises(Refused, match=r"reference is lost") as caught:
         MotionInterlock(rig).reference()
     assert "without torque" in caught.value.why
@@ -487,7 +487,7 @@ def test_a_release_whose_end_cannot_be_read_is_latched_with_its_cause_and_braked
         release_drives(rig, interlock, Unplugged(), lambda _denied: None, lambda: None)
     with pytest.raises(Refused, match=r"while releasing the drives: .*interface is down"):
         interlock.require_free()
-    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    MotionInterlock(rig).found_at_rest((), (), ALL)  # as a reset finds them
     why = MotionInterlock(rig).why_unreferenced(reference.stands_at)
     assert lost in why
     assert bool(lost) is bool(why)
@@ -551,7 +551,7 @@ def test_braked_drives_that_were_not_enabled_after_all_need_not_have_held(
         )
     with pytest.raises(Refused, match="drive 3 stopped answering"):
         MotionInterlock(rig).require_free()
-    MotionInterlock(rig).found_released((), ALL)  # as a reset finds them
+    MotionInterlock(rig).found_at_rest((), (), ALL)  # as a reset finds them
     assert MotionInterlock(rig).why_unreferenced(reference.stands_at) == ""
 
 
@@ -621,12 +621,12 @@ def test_a_motion_from_released_drives_does_not_make_the_reference_good_again() 
     rig = rig_with("incremental")
     interlock, left = MotionInterlock(rig), reference_of(rig)
     interlock.file.write(left)
-    interlock.found_released((), ())
+    interlock.found_at_rest((), (), ())
     assert interlock.kept_reference() == left
-    interlock.found_released((), ALL)
+    interlock.found_at_rest((), (), ALL)
     interlock.begin(Path("run"), interlock.still_counts(left.stands_at))
     _end(interlock, positions=left.stands_at)
-    interlock.confirm_held(left.stands_at)
+    interlock.confirm_at_rest(left.stands_at, held=True)
     assert "without torque" in MotionInterlock(rig).why_unreferenced()
 
 
@@ -637,11 +637,11 @@ def test_drives_that_a_motion_found_without_torque_and_did_not_enable_never_held
     """Absolute encoders never homed, as where STO is open."""
     rig = rig_with("absolute")
     interlock = MotionInterlock(rig)
-    interlock.found_released((), ALL)
+    interlock.found_at_rest((), (), ALL)
     interlock.begin(Path("home"), interlock.still_counts([0] * 8), rehome=rehome)
     assert interlock.why_released((), ALL), "expected to hold, even if this program is killed"
     interlock.end(State.LATCHED, "STO", Path("home"), holding=True, positions=[0] * 8, released=ALL)
-    MotionInterlock(rig).found_released((), ALL)
+    MotionInterlock(rig).found_at_rest((), (), ALL)
     assert interlock.why_unreferenced() == ""
 
 
@@ -768,7 +768,7 @@ def test_two_different_references_are_none(
             ask()
         assert str(own) in caught.value.why
         assert str(shared) in caught.value.why
-    MotionInterlock(rig).confirm_held([0] * 8)
+    MotionInterlock(rig).confirm_at_rest([0] * 8, held=True)
     assert not reference_status(MotionInterlock(rig)).counts, "no reset makes it valid"
     own.write_text("{")
     with pytest.raises(Refused, match="cannot be read") as caught:
@@ -822,7 +822,7 @@ def test_positions_noted_in_the_folder_for_all_users_are_the_later_ones(
     MotionInterlock(rig).file.write(before)
     own, text = MotionInterlock(rig).file.path, before.model_dump_json()
     share()
-    MotionInterlock(rig).confirm_held([42] * 8)
+    MotionInterlock(rig).confirm_at_rest([42] * 8, held=True)
     own.write_text(text)
     kept = MotionInterlock(rig).kept_reference()
     assert kept == before.model_copy(update={"stands_at": [42] * 8})

@@ -115,6 +115,23 @@ def test_every_problem_of_a_file_is_reported_at_once_in_the_order_of_the_file(
     assert [problem[:2] for problem in found] == sorted(problem[:2] for problem in found)
 
 
+@pytest.mark.parametrize("encoder", ["encoder: incremental, ", ""])
+def test_odrives_need_absolute_encoders(encoder: str, tmp_path: Path) -> None:
+    """Homing succeeded, and every motion asked to home again."""
+    text = (CONFIGS / "gachon_8_6_odrive.yaml").read_text(encoding="utf-8")
+    lines = text.replace("encoder: absolute, ", encoder, 2).replace("node_id: 8", "node_id: 63")
+    assert [problem[2:] for problem in problems_in(lines, tmp_path)] == [
+        *(
+            (
+                f"winches[{drive}].encoder",
+                "an ODrive shows no loss of power: its encoder must be absolute over the travel",
+            )
+            for drive in (0, 1)
+        ),
+        ("winches[7].node_id", "an ODrive of a rig has a node id from 1 to 62"),
+    ]
+
+
 def test_an_invalid_part_is_not_compared_with_others(tmp_path: Path) -> None:
     """One mistake is one message: no home "outside" a workspace that is not a number."""
     text = PAPER.replace("upper_mm: [250, 250, 650]", "upper_mm: [250, x, 100]")
