@@ -88,7 +88,7 @@ def test_a_camera_is_found_by_frame_tags_and_the_result_used(folder, truth, tmp_
     wrong = call("track", RIG, tmp_path / "one", "-o", log)
     one_message(wrong, 2, "if the camera moved, restore it or calibrate its pose again")
     second = tmp_path / "one" / "1.png"
-    second.write_bytes((folder / "0.png").read_bytes())
+    second.write_bytes((folder / "1.png").read_bytes())
     wrong = call("track", RIG, tmp_path / "one", "-o", log)
     one_message(wrong, 1, "is not at the pose in the rig file")
     second.unlink()
