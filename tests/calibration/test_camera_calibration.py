@@ -29,7 +29,7 @@ from model.cameras import Z_95
 from model.errors import BadInput
 from model.files.camera_file import LensCovariance
 from model.pose import Array, Pose, matrix_from_rotation_vector
-from tests.calibration.board_images import DISTORTION, MATRIX, SIZE, sample_rays
+from tests.calibration.board_images import DISTORTION, MATRIX, SIZE, picture_of
 
 BOARD = Chessboard(9, 6, 0.025)
 
@@ -61,16 +61,11 @@ def views(count: int, noise: float, seed: int = 5) -> dict[str, DetectedBoard]:
 
 
 def board_picture(pose: Pose) -> np.ndarray:
-    """The board rendered by ray casting, 2 x 2 samples per pixel."""
-    rays = sample_rays() @ pose.rotation
-    origin = -pose.rotation.T @ pose.position
-    on_board = (origin + (-origin[2] / rays[:, 2])[:, None] * rays)[:, :2] / BOARD.square + 1.0
-    squares = np.floor(on_board).astype(int)
-    board = (squares[:, 0] >= 0) & (squares[:, 0] <= BOARD.columns)
-    board &= (squares[:, 1] >= 0) & (squares[:, 1] <= BOARD.rows)
-    black = board & (squares.sum(axis=1) % 2 == 0)
-    values = np.where(black, 30.0, 220.0).reshape(SIZE[1] * 2, SIZE[0] * 2)
-    return np.round(cv2.resize(values, SIZE, interpolation=cv2.INTER_AREA)).astype(np.uint8)
+    """The board with a border of one square, black at its outer corner."""
+    squares = np.add.outer(np.arange(BOARD.rows + 1), np.arange(BOARD.columns + 1)) % 2
+    print_ = np.pad(np.where(squares == 0, 30, 220).astype(np.uint8), 1, constant_values=220)
+    sheet = np.kron(print_, np.ones((50, 50), np.uint8))
+    return picture_of(sheet, BOARD.square / 50, np.full(2, 2.0 * BOARD.square), pose)
 
 
 def check_values(found: CameraCalibration, pixels: float) -> None:
