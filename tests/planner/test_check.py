@@ -258,13 +258,10 @@ def test_a_rotation_violation_states_where_the_rotation_is_largest(gachon, scene
     assert violation.position == pytest.approx(goal.position)
 
 
-@settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), miss=st.sampled_from([-0.01, -2e-6, 0.0, 1e-8, 2e-6, 0.01]))
-def test_a_half_turn_in_one_move_is_refused_whatever_the_limits(
-    gachon, scene_with, seed, miss
-) -> None:
+@pytest.mark.parametrize("miss", [-0.01, -2e-6, 0.0, 1e-8, 2e-6, 0.01])
+def test_a_half_turn_in_one_move_is_refused_whatever_the_limits(gachon, scene_with, miss) -> None:
     """Which way it goes is round-off: the limits were proved for the other way."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     start = Rotation.from_rotvec(rng.uniform(-1.0, 1.0, 3))
     goal = start * Rotation.from_rotvec((np.pi + miss) * unit(rng))
     ends = [Pose(gachon.home.position, rotation.as_matrix()) for rotation in (start, goal)]
