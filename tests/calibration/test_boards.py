@@ -103,7 +103,7 @@ def grid_pictures(board: CircleGrid | TagGrid) -> list[tuple[np.ndarray, Pose]]:
         middle = board.points().mean(axis=0)
     else:
         sheet, origin, middle = kalibr_print(), np.full(2, 0.025), np.array([0.12, 0.1, 0.0])
-    poses = poses_before_the_camera(middle, 8, spread=0.03)
+    poses = poses_before_the_camera(middle, 12, spread=0.03)
     return [(with_noise(picture_of(sheet, PIXEL, origin, p), k), p) for k, p in enumerate(poses)]
 
 
