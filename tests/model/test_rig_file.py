@@ -389,7 +389,7 @@ ODD = st.one_of(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(path=st.sampled_from(leaves(paper_data())), value=ODD)
 def test_any_content_of_a_file_makes_a_rig_or_one_of_our_errors(
     path: tuple[Any, ...], value: Any, tmp_path_factory: pytest.TempPathFactory
