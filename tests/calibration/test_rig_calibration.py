@@ -625,7 +625,7 @@ def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Tru
         judge_rig(fit_rig(rig, data, deviations, LENGTH_DEVIATION), 1e-3, 0.0).verdict
         for data, deviations in (
             (swapped, DEFAULT_DEVIATIONS),
-            (half, {**DEFAULT_DEVIATIONS, "drum_scale": 2e-4}),
+            (tilted.measured, {**DEFAULT_DEVIATIONS, "drum_scale": 2e-4}),
         )
     ]
     assert not any(verdict.good for verdict in verdicts)
