@@ -7,6 +7,7 @@ samples. Unknowns are in standard deviations of the rig file, which acts as a pr
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import inf, radians
 
 import numpy as np
@@ -190,7 +191,7 @@ class RigFitter:
         free = np.eye(len(self._parameters)) if basis is None else basis
         spread = self._parameters.deviations[:, None] * free
         z = np.zeros(free.shape[1])
-        positions, rotations = self._initial_poses()
+        positions, rotations = self._initial_poses
         cost, damping = self._cost(spread @ z, z, positions, rotations), 1e-3
         for _ in range(MOST_STEPS):
             system = self._system(spread @ z, z, spread, positions, rotations)
@@ -212,6 +213,7 @@ class RigFitter:
             next_step="check units, the order of the cables and the homing of the drives",
         )
 
+    @cached_property
     def _initial_poses(self) -> tuple[Array, Array]:
         """Measured poses; missing ones and missing rotations from the lengths by the rig file."""
         rig, counted, measured = self._parameters.rig, self._model.counted, self._measured

@@ -132,11 +132,12 @@ def _rays(
     def exact(points: Array) -> Array:
         return rays_of(lens, np.array(matrix).reshape(3, 3), np.array(distortion), points)
 
-    (columns, across), (rows, down) = (_between(SAMPLES * size) for size in (width, height))
+    columns, rows = (_nodes(SAMPLES * size) for size in (width, height))
     coarse = exact(np.stack(np.meshgrid(columns, rows), axis=-1)).reshape(len(rows), -1, 2)
     rays = np.empty((SAMPLES * height, SAMPLES * width, 2), dtype=np.float32)
     for axis in (0, 1):
-        rays[..., axis] = down @ coarse[..., axis] @ across.T
+        down = _between(coarse[..., axis].T, SAMPLES * height)
+        rays[..., axis] = _between(down.T, SAMPLES * width)
     y, x = np.divmod(np.arange(0, rays.size // 2, RAYS_CHECKED), SAMPLES * width)
     checked = exact((np.column_stack([x, y]) + 0.5) / SAMPLES - 0.5)
     off = np.abs(rays[y, x] - checked).max(axis=1) / (1.0 + np.sum(checked**2, axis=1))
@@ -147,26 +148,24 @@ def _rays(
     return rays
 
 
-def _between(count: int) -> tuple[Array, Array]:
-    """Position of every `RAY_STEP`-th sample, [px], and its weight in each of ``count`` samples.
+def _nodes(count: int) -> Array:
+    """Position of every `RAY_STEP`-th of ``count`` samples, extending beyond both ends, [px]."""
+    return (np.arange(-1, -(-count // RAY_STEP) + 2) * RAY_STEP + 0.5) / SAMPLES - 0.5
 
-    Returns:
-        Pixels, shape (k,), extending beyond both ends, and weights, shape (count, k).
-    """
-    whole, u = np.divmod(np.arange(count) / RAY_STEP, 1.0)
-    first = whole.astype(int)
-    nodes = (np.arange(-1, first[-1] + 3) * RAY_STEP + 0.5) / SAMPLES - 0.5
-    weights = np.zeros((count, len(nodes)))
-    for k, weight in enumerate(
-        (
+
+def _between(values: Array, count: int) -> Array:
+    """Values at ``count`` samples, shape (n, count), from those at `_nodes`, shape (n, k)."""
+    u = np.arange(RAY_STEP) / RAY_STEP
+    weights = np.array(
+        [
             -u * (u - 1.0) * (u - 2.0) / 6.0,
             (u + 1.0) * (u - 1.0) * (u - 2.0) / 2.0,
             -(u + 1.0) * u * (u - 2.0) / 2.0,
             (u + 1.0) * u * (u - 1.0) / 6.0,
-        )
-    ):
-        weights[np.arange(count), first + k] = weight
-    return nodes, weights
+        ]
+    )
+    around = np.stack([values[:, k : values.shape[1] - 3 + k] for k in range(4)], axis=-1)
+    return np.asarray((around @ weights).reshape(len(values), -1)[:, :count])
 
 
 # Image sequences.

@@ -7,7 +7,8 @@ including lens distortion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass
 from functools import lru_cache
 
 import cv2
@@ -37,6 +38,8 @@ from tracking.detection.tags import dictionary, modules_across
 SAMPLES = 2
 #: Distance within which surfaces count as touching, so that the one drawn later is visible, [m].
 TOUCHING = 5e-4
+#: Samples that are drawn at once.
+BAND = 32768
 
 Image32 = NDArray[np.float32]
 Image8 = NDArray[np.uint8]
@@ -134,6 +137,13 @@ class Canvas:
         )
         return None if common.empty else self.part(common)
 
+    def bands(self) -> Iterator[Canvas]:
+        """Views of a few rows each, small enough for a processor's cache."""
+        left, top, right, bottom = astuple(self.region)
+        height = max(1, BAND // (SAMPLES**2 * (right - left)))
+        for first in range(top, bottom, height):
+            yield self.part(CanvasRegion(left, first, right, min(first + height, bottom)))
+
     def paint(self, depth: Image32, brightness: Image32, mask: NDArray[np.bool_]) -> None:
         """Draws a surface where it is in front of the present content."""
         seen = mask & (depth < self.depth + np.float32(TOUCHING))
@@ -165,15 +175,16 @@ def draw_quad(
     height, width = texture.shape
     to_texels = np.array([[width / 2, 0, width / 2 - 0.5], [0, height / 2, height / 2 - 0.5]])
     rows = np.vstack([to_texels @ inverse, inverse[2]]).astype(np.float32)
-    met = cv2.transform(part.rays, rows)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = np.asarray(1.0 / met[..., 2], dtype=np.float32)
-        column = met[..., 0] * depth
-        row = met[..., 1] * depth
-    mask = (met[..., 2] > 0) & (column >= -0.5) & (column < width - 0.5)
-    mask &= (row >= -0.5) & (row < height - 0.5)
-    light = cv2.remap(texture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    part.paint(depth, np.asarray(light, dtype=np.float32), mask)
+    for band in part.bands():
+        met = cv2.transform(band.rays, rows)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = np.asarray(1.0 / met[..., 2], dtype=np.float32)
+            column = met[..., 0] * depth
+            row = met[..., 1] * depth
+        mask = (met[..., 2] > 0) & (column >= -0.5) & (column < width - 0.5)
+        mask &= (row >= -0.5) & (row < height - 0.5)
+        light = cv2.remap(texture, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        band.paint(depth, np.asarray(light, dtype=np.float32), mask)
 
 
 def draw_triangles(canvas: Canvas, vertices: Array, brightness: Array) -> None:

@@ -6,6 +6,7 @@ from functools import cache
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from model.pose import Array, Pose, matrix_from_rotation_vector
 
@@ -29,15 +30,14 @@ def poses_before_the_camera(
 
 
 @cache
-def sample_rays(distortion: tuple[float, ...] = tuple(DISTORTION)) -> Array:
-    """Rays of 2 x 2 samples per pixel, camera frame, shape (n, 3); cached for all images."""
+def sample_rays(distortion: tuple[float, ...] = tuple(DISTORTION)) -> NDArray[np.float32]:
+    """Rays (x, y, 1) of 2 x 2 samples per pixel, camera frame, x and y; cached for all images."""
     columns = (np.arange(SIZE[0] * _SUB) + 0.5) / _SUB - 0.5
     rows = (np.arange(SIZE[1] * _SUB) + 0.5) / _SUB - 0.5
     pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
     stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-9)
-    lens = np.array(distortion)
-    flat = cv2.undistortPoints(pixels, MATRIX, lens, criteria=stop).reshape(-1, 2)
-    return np.column_stack([flat, np.ones(len(flat))])
+    flat = cv2.undistortPoints(pixels, MATRIX, np.array(distortion), criteria=stop)
+    return flat.reshape(SIZE[1] * _SUB, SIZE[0] * _SUB, 2).astype(np.float32)
 
 
 def picture_of(
@@ -57,17 +57,15 @@ def picture_of(
         distortion: Of the lens.
     """
     rows, columns = _around(print_.shape, pixel, origin, pose, distortion)
-    rays = sample_rays(distortion).reshape(SIZE[1] * _SUB, -1, 3)[rows, columns] @ pose.rotation
     eye = -pose.rotation.T @ pose.position
-    on_board = eye[:2] + (-eye[2] / rays[..., 2])[..., None] * rays[..., :2]
-    found = ((on_board + origin) / pixel - 0.5).astype(np.float32)
+    # From a ray to where it meets the board, in pixels of the print, times its way to the board.
+    across = (eye[:2] + origin)[:, None] * pose.rotation[:, 2] - eye[2] * pose.rotation[:, :2].T
+    to_print = np.vstack([across / pixel - 0.5 * pose.rotation[:, 2], pose.rotation[:, 2]])
+    met = cv2.transform(sample_rays(distortion)[rows, columns], to_print.astype(np.float32))
+    found = met[..., :2] / met[..., 2:]
     fine = np.full((SIZE[1] * _SUB, SIZE[0] * _SUB), 150.0, np.float32)
     fine[rows, columns] = cv2.remap(
-        print_.astype(np.float32),
-        found[..., 0],
-        found[..., 1],
-        cv2.INTER_LINEAR,
-        borderValue=150.0,
+        print_.astype(np.float32), found, None, cv2.INTER_LINEAR, borderValue=150.0
     )
     return np.round(cv2.resize(fine, SIZE, interpolation=cv2.INTER_AREA)).astype(np.uint8)
 
@@ -81,8 +79,10 @@ def _around(
 ) -> tuple[slice, slice]:
     """Rows and columns of the samples that may show a print; see `picture_of`."""
     y, x = (np.linspace(-1.0, size + 1.0, 30) * pixel for size in shape[:2])
-    rim = [(a, b) for a in x for b in y if a in x[[0, -1]] or b in y[[0, -1]]]
-    points = np.column_stack([np.array(rim) - origin, np.zeros(len(rim))])
+    sides = [np.broadcast_arrays(x, end) for end in y[[0, -1]]]
+    sides += [np.broadcast_arrays(end, y) for end in x[[0, -1]]]
+    rim = np.concatenate([np.column_stack(side) for side in sides])
+    points = np.column_stack([rim - origin, np.zeros(len(rim))])
     zero = np.zeros(3)
     pixels = cv2.projectPoints(pose.apply(points), zero, zero, MATRIX, np.array(distortion))[0]
     low, high = pixels.reshape(-1, 2).min(axis=0), pixels.reshape(-1, 2).max(axis=0)
@@ -93,5 +93,5 @@ def _around(
 
 def with_noise(image: np.ndarray, seed: int) -> np.ndarray:
     """An image with the noise of a sensor."""
-    noise = np.random.default_rng(seed).normal(scale=1.5, size=image.shape)
-    return np.clip(image + noise, 0.0, 255.0).round().astype(np.uint8)
+    noise = np.random.default_rng(seed).standard_normal(image.shape, np.float32)
+    return np.clip(image + np.float32(1.5) * noise, 0.0, 255.0).round().astype(np.uint8)

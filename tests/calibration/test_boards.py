@@ -35,7 +35,8 @@ from tracking.detection.diagnostics import RowNumbering, row_numbering, tag_offs
 
 CHARUCO = Charuco(7, 5, 0.040, 0.030, "4X4_50")
 TAGS = TagGrid(5, 4, 0.040, 0.012, "tag36h11", first=20)
-BARREL = np.array([-0.45, 0.25, 0.0, 0.0, -0.05])
+STRONG = (-0.45, 0.25, 0.0, 0.0, -0.05)
+PLAIN = tuple(DISTORTION)
 PIXEL = 0.0005
 
 
@@ -168,7 +169,7 @@ def test_boards_with_black_and_white_exchanged_are_found(board) -> None:
 
 
 def test_the_order_of_kalibr_is_named_where_the_numbers_contradict_the_rows() -> None:
-    shown = [image for image, _, _ in found_in(KALIBR)[:4]]
+    shown = [image for image, _, _ in found_in(KALIBR)[:1]]
     rows = replace(KALIBR, order="rows")
     with pytest.raises(BadInput) as caught:
         fit_camera([(f"{k}", image) for k, image in enumerate(shown)], rows)
@@ -227,7 +228,7 @@ def test_points_are_found_where_they_are(board: Charuco | TagGrid, limit: float)
 def test_saddles_of_charuco_boards_are_not_biased_by_markers_or_blur(
     board: Charuco, times: float, blur: float, limit: float
 ) -> None:
-    shown = charuco_pictures(board, times, blur)
+    shown = charuco_pictures(board, times, blur, PLAIN)
     errors = off(board, shown)
     assert len(errors) > 20
     assert np.sqrt(np.mean(errors**2)) < limit
@@ -238,16 +239,16 @@ def test_saddles_of_charuco_boards_are_not_biased_by_markers_or_blur(
 @pytest.mark.parametrize(
     ("board", "times", "blur", "lens"),
     [
-        (CHARUCO, 1.0, 0.7, DISTORTION),
-        (CHARUCO, 0.7, 0.7, BARREL),
-        (Charuco(8, 6, 0.040, 0.0293, "5X5_100"), 1.0, 1.2, DISTORTION),
-        (Charuco(8, 6, 0.040, 0.030, "5X5_100"), 2.0, 0.0, DISTORTION),
-        (Charuco(5, 7, 0.040, 0.020, "6X6_250"), 1.0, 0.7, DISTORTION),
+        (CHARUCO, 1.0, 0.7, PLAIN),
+        (CHARUCO, 0.7, 0.7, STRONG),
+        (Charuco(8, 6, 0.040, 0.0293, "5X5_100"), 1.0, 1.2, PLAIN),
+        (Charuco(8, 6, 0.040, 0.030, "5X5_100"), 2.0, 0.0, PLAIN),
+        (Charuco(5, 7, 0.040, 0.020, "6X6_250"), 1.0, 0.7, PLAIN),
     ],
 )
 @pytest.mark.parametrize("stated", [1.0, 0.85])
 def test_the_size_of_markers_is_measured_whatever_is_stated(
-    board: Charuco, times: float, blur: float, lens: np.ndarray, stated: float
+    board: Charuco, times: float, blur: float, lens: tuple[float, ...], stated: float
 ) -> None:
     wrong = replace(board, marker=stated * board.marker)
     seen = [wrong.find(image) for image, _ in charuco_pictures(board, times, blur, lens)]
@@ -257,8 +258,9 @@ def test_the_size_of_markers_is_measured_whatever_is_stated(
     assert np.abs(measured - 1.0).max() < 0.02
 
 
+@cache
 def charuco_pictures(
-    board: Charuco, times: float, blur: float, lens: np.ndarray = DISTORTION
+    board: Charuco, times: float, blur: float, lens: tuple[float, ...] = PLAIN
 ) -> list[tuple[np.ndarray, Pose]]:
     """A board at several times the usual distance, in blurred images.
 
@@ -270,7 +272,7 @@ def charuco_pictures(
     for k, pose in enumerate(poses_before_the_camera(middle, 6, seed=7)):
         far = replace(pose, position=(pose.position + pose.rotation @ middle) * times)
         far = replace(far, position=far.position - pose.rotation @ middle)
-        image = picture_of(sheet, board.square / 120, np.zeros(2), far, tuple(lens))
+        image = picture_of(sheet, board.square / 120, np.zeros(2), far, lens)
         image = cv2.GaussianBlur(image, (0, 0), blur) if blur else image
         shown.append((with_noise(image, k), far))
     return shown
@@ -362,6 +364,14 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     assert "mirrored" in caught.value.why
 
 
+def part_of(board: Charuco | TagGrid) -> np.ndarray:
+    """A part of the print, as large families take long to exclude for every tag."""
+    part = tag_print()[:232, :232] if board is TAGS else charuco_print()[:160]
+    image = np.full((280, 620), 255, np.uint8)
+    image[30 : 30 + len(part), 30 : 30 + len(part[0])] = part
+    return image
+
+
 @pytest.mark.parametrize(
     ("board", "wrong", "named"),
     [
@@ -371,7 +381,7 @@ def test_another_board_and_a_mirrored_one_are_not_found(board: Charuco | TagGrid
     ],
 )
 def test_the_message_names_what_images_show_instead(board, wrong, named: str) -> None:
-    image = found_in(board)[0][0]
+    image = part_of(board)
     with pytest.raises(BadInput) as caught:
         fit_camera([("a", image), ("b", np.full_like(image, 128))], wrong)
     assert "was found in 0 of 2 images" in caught.value.what
@@ -381,7 +391,7 @@ def test_the_message_names_what_images_show_instead(board, wrong, named: str) ->
 
 def test_the_message_names_what_most_images_show_instead() -> None:
     """One image of another board among six."""
-    image, stray = (found_in(board)[0][0] for board in (TAGS, CHARUCO))
+    image, stray = part_of(TAGS), part_of(CHARUCO)
     named = [("0.png", stray), *((f"{k}.png", image) for k in range(1, 7))]
     with pytest.raises(BadInput) as caught:
         fit_camera(named, TagGrid(5, 4, 0.040, 0.012, "tag25h9"))
@@ -410,8 +420,8 @@ def whole_pictures(board: Charuco | TagGrid, least: int) -> list[tuple[str, np.n
 )
 def test_tags_numbered_otherwise_are_named(wrong: dict[str, int], advice: str) -> None:
     """They would fit a homography by tens of pixels, which no lens model cures."""
-    images = whole_pictures(TAGS, 76)[:2]
-    assert len(images) == 2
+    images = whole_pictures(TAGS, 76)[:1]
+    assert images
     with pytest.raises(BadInput) as caught:
         fit_camera(images, replace(TAGS, **wrong))
     assert advice in caught.value.why

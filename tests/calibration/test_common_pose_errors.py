@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,12 @@ import pytest
 from numpy.random import default_rng
 
 from calibration.geometry.calibrate import RigCalibration, fit_rig, workspace_poses
-from calibration.geometry.fit import RigFitter
-from calibration.geometry.identifiability import identified, uncertainty_of_rig
+from calibration.geometry.fit import RigFit, RigFitter
+from calibration.geometry.identifiability import (
+    Observability,
+    identified,
+    uncertainty_of_rig,
+)
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
@@ -30,7 +35,7 @@ from tests.calibration.synthetic_rig import (
 
 LENGTH, TURN = 1e-3, float(np.radians(0.05))
 GEOMETRY = ("outlets", "anchors", "drum_scale", "offsets")
-RIGS = range(6)
+RIGS = range(5)
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +68,7 @@ def inside(found: RigCalibration, built: BuiltRig, groups: tuple[str, ...]) -> l
     return [bool(hit) for g in groups for hit in off[g] < half_widths[slices[g]]]
 
 
+@cache
 def calibrated(rig: Rig, seed: int, kind: str) -> tuple[RigCalibration, BuiltRig]:
     """A rig with common errors, which are stated unless ``kind`` is ``hidden``."""
     built = built_rig(rig, seed, alike=True)
@@ -115,12 +121,18 @@ def test_more_samples_do_not_reduce_a_common_error(rig: Rig) -> None:
     assert parts[1] == pytest.approx(parts[0], rel=0.1)
 
 
+@pytest.fixture(scope="module")
+def thirty(rig: Rig) -> tuple[RigMeasurements, RigFit, Observability]:
+    """Samples with stated common errors, and their fit."""
+    data = measured(built_rig(rig, 2, alike=True), 30, 6).with_added_deviation(LENGTH, TURN)
+    return data, *identified(Parameters.of(rig, DEFAULT_DEVIATIONS), data, LENGTH_NOISE)
+
+
 @pytest.mark.parametrize("error", range(9))
-def test_the_change_by_a_common_error_is_that_of_a_fit_with_it(rig: Rig, error: int) -> None:
-    parameters = Parameters.of(rig, DEFAULT_DEVIATIONS)
-    plain = measured(built_rig(rig, 2, alike=True), 30, 6)
-    data = plain.with_added_deviation(LENGTH, TURN)
-    fit, observability = identified(parameters, data, LENGTH_NOISE)
+def test_the_change_by_a_common_error_is_that_of_a_fit_with_it(
+    rig: Rig, thirty: tuple[RigMeasurements, RigFit, Observability], error: int
+) -> None:
+    parameters, (data, fit, observability) = Parameters.of(rig, DEFAULT_DEVIATIONS), thirty
     stated = uncertainty_of_rig(parameters, data, fit, observability).common[:, error]
     unit = np.eye(9)[error]
     there = moved(data, LENGTH * unit[:3], TURN * unit[3:6], TURN * unit[6:])
@@ -141,6 +153,7 @@ def test_poses_that_were_not_measured_share_no_error(rig: Rig) -> None:
     assert data.part(np.arange(12) < 5).common_errors.shape == (5, 6, 9)
 
 
+@cache
 def scattered(rig: Rig, seed: int, position: float, turn: float, length: float) -> RigCalibration:
     """The calibration of a rig with noise that is larger than stated, by these factors.
 

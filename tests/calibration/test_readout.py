@@ -73,7 +73,7 @@ def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: P
 
 
 def test_a_camera_that_exposes_all_rows_at_once_has_none(rig: Rig, tmp_path: Path) -> None:
-    write_film(rig, tmp_path, 0.0, 12)
+    write_film(rig, tmp_path, 0.0, 9)
     found = measure_readout(rig, tmp_path, rate=RATE).found
     assert abs(found.readout) < max(found.half_width, 5e-4)
 

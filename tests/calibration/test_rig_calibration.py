@@ -617,9 +617,10 @@ def test_a_lost_reply_does_not_lose_the_tensions_of_a_rest() -> None:
 
 def test_numbers_far_from_the_rig_file_are_not_good_enough(rig: Rig, tilted: Truth) -> None:
     """Winches 1 and 2 swapped, or a stated drum deviation far below the true error."""
-    counts = tilted.measured.counts.copy()
+    half = tilted.measured.part(np.arange(60) < 30)
+    counts = half.counts.copy()
     counts[:, [0, 1]] = counts[:, [1, 0]]
-    swapped = replace(tilted.measured, counts=counts)
+    swapped = replace(half, counts=counts)
     verdicts = [
         judge_rig(fit_rig(rig, data, deviations, LENGTH_DEVIATION), 1e-3, 0.0).verdict
         for data, deviations in (

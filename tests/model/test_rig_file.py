@@ -406,7 +406,7 @@ ODD = st.one_of(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(path=st.sampled_from(leaves(paper_data())), value=ODD)
 def test_any_content_of_a_file_makes_a_rig_or_one_of_our_errors(
     path: tuple[Any, ...], value: Any, tmp_path_factory: pytest.TempPathFactory
@@ -418,7 +418,8 @@ def test_any_content_of_a_file_makes_a_rig_or_one_of_our_errors(
         inner = inner[part]
     inner[path[-1]] = value
     file = tmp_path_factory.mktemp("odd") / "rig.yaml"
-    file.write_text(yaml.safe_dump(changed, allow_unicode=True), encoding="utf-8")
+    text = yaml.dump(changed, Dumper=yaml.CSafeDumper, allow_unicode=True)  # the quick one
+    file.write_text(text, encoding="utf-8")
     found = ""
     try:
         load_rig(file)

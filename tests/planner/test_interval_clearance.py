@@ -38,7 +38,7 @@ def random_case(gachon, scene_with, seed):
     return ClearanceModel(gachon, scene_with(*obstacles)), PosePath(gachon, poses), poses
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_with, seed) -> None:
     """Overlaps are left out: how deep they are is a bound, not a distance."""
@@ -60,7 +60,7 @@ def test_the_smallest_clearance_is_that_of_the_bound_by_motion(gachon, scene_wit
     assert found.value - found.proved <= TOLERANCE + 1e-9
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_no_pose_of_a_path_is_nearer_than_is_proved(gachon, scene_with, seed) -> None:
     """Nor free, where it overlaps."""

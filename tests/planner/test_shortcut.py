@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from planner.rrt.path import LengthCost, cheapest_through, pull_tight
@@ -40,6 +40,7 @@ def wandering_path(seed: int) -> np.ndarray:
     return 0.5 * np.column_stack([np.cos(angles), np.sin(angles)])
 
 
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1))
 def test_every_step_keeps_ends_and_freedom_and_never_costs_more(seed: int) -> None:
     path = wandering_path(seed)

@@ -62,7 +62,7 @@ def test_two_cameras_give_a_better_pose_than_each_alone(
     rng = np.random.default_rng(8)
     squares: dict[str, list[float]] = {"front": [], "side": [], "both": []}
     values = []
-    for frame in range(12):
+    for frame in range(8):
         truth = Pose(
             rng.uniform([-0.1, -0.1, 0.35], [0.1, 0.1, 0.5]),
             matrix_from_rotation_vector(rng.normal(size=3) * 0.1),
@@ -183,7 +183,7 @@ def test_what_is_accepted_as_agreeing_is_within_the_stated_covariance(
         share: Unstated error of each, in `UNSTATED_ERROR`.
     """
     rng, truth, values = np.random.default_rng(5), HERE, []
-    for _ in range(250):
+    for _ in range(150):
         seen = {}
         for name in "abc"[:count]:
             root = rng.normal(size=(6, 6)) / np.sqrt(6.0) + 0.5 * np.eye(6)
@@ -196,7 +196,7 @@ def test_what_is_accepted_as_agreeing_is_within_the_stated_covariance(
         if isinstance(found, PoseMeasurement):
             error = error_of(found, truth)
             values.append(error @ np.linalg.solve(found.covariance + found.shared, error))
-    assert len(values) > 200
+    assert len(values) > 120
     assert 2.5 < np.mean(values) < 8.5
 
 
@@ -302,7 +302,7 @@ def test_an_offset_between_clocks_is_measured_beside_errors_of_the_cameras_poses
     late: float, apart: float
 ) -> None:
     """The poses disagree by 3 mm at rest already, on average."""
-    for seed in range(3):
+    for seed in range(2):
         rng = np.random.default_rng(seed)
         (text,) = clock_remarks(there_and_at_rest, 15.0, late, rng, 1e-3, apart)
         stated = re.search(r": images of (\w) are taken (\d+) ± (\d+) ms", text)
@@ -316,7 +316,7 @@ def test_an_offset_between_clocks_is_measured_beside_errors_of_the_cameras_poses
 @pytest.mark.parametrize("apart", [0.0, 0.03])
 @pytest.mark.parametrize("tilt", [0.0, 1e-3, 3e-3])
 def test_wrong_poses_of_cameras_are_not_blamed_on_their_clocks(tilt: float, apart: float) -> None:
-    for seed in range(5):
+    for seed in range(3):
         rng = np.random.default_rng(seed)
         assert clock_remarks(there_and_at_rest, 15.0, 0.0, rng, tilt, apart) == []
 

@@ -244,7 +244,7 @@ def test_tags_that_are_off_as_stated_count_once(rig: Rig) -> None:
     )
     stated = replace(rig, tag_error=0.25e-3, outlet_error=0.0, anchor_error=0.0)
     shared = SharedErrors(stated, camera)
-    for _ in range(400):
+    for _ in range(200):
         turn = matrix_from_rotation_vector(rng.normal(size=3) * 0.08)
         pose = Pose(rng.uniform([-0.1, -0.1, 0.35], [0.15, 0.1, 0.55]), turn)
         views = []

@@ -218,7 +218,12 @@ def test_a_camera_whose_times_are_not_needed_is_used_from_its_first_image(
         queue.unplug()
 
 
-def test_a_camera_that_repeats_one_picture_for_long_is_lost(queue: Queue, camera: Camera) -> None:
+def test_a_camera_that_repeats_one_picture_for_long_is_lost(
+    queue: Queue, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A small one: it takes thousands of images."""
+    camera = replace(camera, width=64, height=48)
+    monkeypatch.setattr(queue, "_shape", (48, 64, 3))
     queue.repeats = 100_000
     queue.take(OPENING)
     with LiveCamera("7", camera, queue.clock) as live:

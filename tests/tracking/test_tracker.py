@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from itertools import pairwise
 
 import cv2
@@ -73,7 +74,7 @@ def test_rotated_poses_are_found_without_a_guess_and_never_mirrored(
 ) -> None:
     rng, tracker = np.random.default_rng(5), Tracker(rig, camera)
     found_count = 0
-    for frame in range(40):
+    for frame in range(24):
         position = rng.uniform([-0.2, -0.2, 0.2], [0.2, 0.2, 0.6])
         truth = Pose(position, matrix_from_rotation_vector(rng.normal(size=3) * 0.15))
         tracker.forget()
@@ -85,7 +86,7 @@ def test_rotated_poses_are_found_without_a_guess_and_never_mirrored(
         assert np.linalg.norm(error[:3]) < 3e-3
         assert np.linalg.norm(error[3:]) < np.radians(1.0)
         assert np.all(np.abs(error) < 6.0 * np.sqrt(np.diag(found.covariance)))
-    assert found_count >= 35
+    assert found_count >= 21
 
 
 def test_a_sudden_jump_is_followed_by_searching_the_whole_picture(
@@ -262,10 +263,14 @@ def test_another_print_of_a_covered_frame_tag_costs_one_pose_and_not_the_camera(
     tag, truth = rig.frame_tags[0], Pose.level([0.0, 0.0, 0.445])
     rig = replace(rig, frame_tags=(tag,))
 
-    def seen_with_it_at(shift: float, number: int) -> Image:
+    @cache
+    def with_it_at(shift: float) -> SyntheticCamera:
         pose = replace(tag.pose, position=tag.pose.position + shift * np.eye(3)[1])
         real = replace(rig, frame_tags=(replace(tag, pose=pose),))
-        return SyntheticCamera(real, scene, camera, seed=1).render(truth, number)
+        return SyntheticCamera(real, scene, camera, seed=1)
+
+    def seen_with_it_at(shift: float, number: int) -> Image:
+        return with_it_at(shift).render(truth, number)
 
     shifts = [0.0, 0.05, 0.0, 0.0, 0.05, 0.1, 0.0, 0.05]
     tracker = Tracker(rig, camera, TrackerSettings(camera_check_period=1))

@@ -17,6 +17,7 @@ from planner.anytime.infeasibility import FINENESSES, flood_reaches, is_separate
 from planner.check import check_path
 from planner.planning import make_plan
 from planner.settings import OBJECTIVES, OptimalSettings
+from tests.effort import cases
 from tests.planner.anytime.scenes_of_the_search import (
     best_points,
     ends_of,
@@ -52,7 +53,7 @@ def test_positions_on_the_same_side_are_not_called_separated(gachon, divided, sc
     assert not is_separated(problem(gachon, scene_with(**ACROSS)).world, *ends_of(divided))
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", range(cases(30, 0.4)))
 def test_nothing_is_called_separated_where_a_path_is_known(gachon, seed) -> None:
     scene = random_question(gachon, 100 + seed)
     if scene is None:
@@ -62,7 +63,7 @@ def test_nothing_is_called_separated_where_a_path_is_known(gachon, seed) -> None
         assert not is_separated(asked.world, *ends_of(scene))
 
 
-@settings(max_examples=20)  # a world is made for each
+@settings(max_examples=10)  # a world is made for each
 @given(st.floats(150.0, 420.0), st.integers(0, 100))
 def test_a_low_post_is_never_called_a_wall_where_a_path_leads_over_it(
     gachon, scene_with, high, seed

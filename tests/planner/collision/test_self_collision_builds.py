@@ -22,6 +22,7 @@ from planner.collision.world import (
     unproved_robot,
 )
 from tests.configs import GACHON
+from tests.effort import cases
 from tests.planner.collision.random_builds import Build, random_build, rig_of
 from tests.planner.collision.sampled_oracle import changed_rig, random_scene
 
@@ -110,7 +111,7 @@ def test_rigs_with_anchors_off_the_box_of_their_platform_have_free_edges() -> No
 def test_edges_of_every_build_are_free_up_to_touching_and_no_further(turns: bool) -> None:
     rng = np.random.default_rng(11)
     tested = {"free": 0, "refused": 0}
-    for _, rig in builds(24, 5 + turns):
+    for _, rig in builds(cases(24, 0.5), 5 + turns):
         world = build_world(rig, EMPTY, np.eye(3), 0.01)
         close = CLOSE_IF_BOUNDED if turns or rig.pulley_radius else CLOSE
         for start, end in zip(*edges_of(rig, rng, 6), strict=True):
@@ -125,13 +126,13 @@ def test_edges_of_every_build_are_free_up_to_touching_and_no_further(turns: bool
             tested["refused"] += 1
             robot = unproved_robot(rig, world, max(least, 0.0) + CLOSE)
             assert not self_rotating_edge_free(world, robot, *args)
-    assert min(tested.values()) > 60
+    assert min(tested.values()) > cases(60, 0.5)
 
 
 def test_edges_are_decided_the_same_with_and_without_precomputed_proofs() -> None:
     rng = np.random.default_rng(12)
     answers: list[bool] = []
-    for _, rig in builds(10, 6):
+    for _, rig in builds(cases(10, 0.5), 6):
         world = build_world(rig, EMPTY, np.eye(3), 0.01)
         starts, ends = edges_of(rig, rng, 20)
         least = np.array(
@@ -153,7 +154,7 @@ def test_edges_are_decided_the_same_with_and_without_precomputed_proofs() -> Non
 def test_no_region_is_proved_in_which_a_pose_is_too_near() -> None:
     rng = np.random.default_rng(13)
     proved = 0
-    for _, rig in builds(40, 7):
+    for _, rig in builds(cases(40, 0.5), 7):
         world = build_world(rig, EMPTY, np.eye(3), 0.01)
         model = ClearanceModel(rig, EMPTY)
         for _ in range(6):
@@ -177,12 +178,12 @@ def test_no_region_is_proved_in_which_a_pose_is_too_near() -> None:
             proved += sum(answer == PROVED for answer in found)
             if all(answer == PROVED for answer in found):
                 assert least >= clearance - 1e-9
-    assert proved > 1000
+    assert proved > cases(1000, 0.5)
 
 
 def test_a_single_pose_is_decided_at_once() -> None:
     rng = np.random.default_rng(14)
-    for _, rig in builds(60, 8):
+    for _, rig in builds(cases(60, 0.5), 8):
         world = build_world(rig, EMPTY, np.eye(3), 0.01)
         model = ClearanceModel(rig, EMPTY)
         for position in rng.uniform(rig.workspace_lower, rig.workspace_upper, (10, 3)):

@@ -32,7 +32,7 @@ def passed(start: Array, end: Array, grown: float) -> list[tuple[int, ...]]:
 
 def test_a_move_meets_the_cells_of_its_slabs() -> None:
     rng = np.random.default_rng(0)
-    for trial in range(40):
+    for trial in range(20):
         start, end = rng.uniform(*LIMITS, (2, 3))
         still = rng.random(3) < 0.2
         end[still] = start[still]
