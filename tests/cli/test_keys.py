@@ -164,11 +164,11 @@ def test_a_second_key_ends_the_press_and_moves_from_rest() -> None:
     assert not ((steps[:, 1] != 0.0) & (steps[:, 2] != 0.0)).any(), "along one axis at a time"
 
 
-@pytest.mark.parametrize("key", ["-", "f", "x"])
-def test_any_other_key_ends_the_press(key: str) -> None:
-    seen = jogged([(1.0, 1.3, "right"), (1.3, 1.4, key), (3.0, 9.0, "q")])
-    held = jogged([(1.0, 1.4, "right"), (3.0, 9.0, "q")])
-    assert seen[-1][1][0] < held[-1][1][0]
+def test_any_other_key_ends_the_press() -> None:
+    held = jogged([(1.0, 1.4, "right"), (2.5, 9.0, "q")])
+    for key in "-fx":
+        seen = jogged([(1.0, 1.3, "right"), (1.3, 1.4, key), (2.5, 9.0, "q")])
+        assert seen[-1][1][0] < held[-1][1][0], key
 
 
 def test_a_key_that_waited_while_the_program_paused_begins_no_press(
