@@ -126,9 +126,10 @@ def _on(channel: str, file: Path) -> Rig:
 
 @pytest.mark.slow
 @pytest.mark.real_time
-@pytest.mark.parametrize("braked", [True, False])
 @pytest.mark.parametrize("latched", [True, False])
-@pytest.mark.parametrize("holding", [True, False])
+@pytest.mark.parametrize(  # brakes decide only where others hold
+    ("braked", "holding"), [(True, True), (False, True), (True, False)]
+)
 def test_the_next_steps_after_a_drive_in_fault_lead_out_of_it(
     slow_run: PreparedRun,
     slow_rig: Path,
