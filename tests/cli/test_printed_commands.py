@@ -146,6 +146,8 @@ def test_printed_commands_work_in_a_newcomers_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    # matplotlib takes longer than all else; tests/planner/workspace has it draw.
+    monkeypatch.setattr("planner.workspace.files.write_figures", lambda *_: None)
     _tables(tmp_path)
     names = {
         "RIG": "configs/gachon_8_6.yaml",

@@ -51,7 +51,8 @@ def all_commands() -> list[tuple[str, str]]:
     sources = [p for package in PACKAGES for p in (ROOT / package).rglob("*.py")]
     pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
     for path in sources:
-        for text in texts(ast.parse(path.read_text())):
+        source = path.read_text()
+        for text in texts(ast.parse(source)) if "cdpr" in source else ():
             found |= {(str(path.relative_to(ROOT)), c) for c in commands_in(text)}
     for path in pages:
         found |= {(str(path.relative_to(ROOT)), c) for c in commands_in(path.read_text())}
