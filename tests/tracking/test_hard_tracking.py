@@ -146,7 +146,7 @@ def test_two_prints_of_one_tag_are_ambiguous(rig: Rig, narrow: Camera, empty: Sc
     assert isinstance(found, NoPose)
     assert found.reason == "tag 305 is seen more than once"
     with pytest.raises(NoPlatformSeen) as caught:
-        list(track([Frame(0.0, image, "a.png")], Tracker(one, camera)))
+        list(track([Frame(0.0, image, "a.png")], Tracker(one, narrow)))
     assert "another print" in caught.value.why
     assert "remove or cover the second print" in caught.value.next_step
 
