@@ -152,6 +152,10 @@ def is_folder(path: Path) -> bool:
         raise unreadable(path, error) from None
 
 
+#: In names of files, seconds since 1970 have at least so many digits; shorter numbers may be counts.
+SECONDS_SINCE_1970 = 9
+
+
 def files_in(folder: Path) -> list[Path]:
     """What a folder contains.
 
