@@ -152,7 +152,7 @@ def is_folder(path: Path) -> bool:
         raise unreadable(path, error) from None
 
 
-#: In names of files, seconds since 1970 have at least so many digits; shorter numbers may be counts.
+#: Seconds since 1970 have at least so many digits in a name; shorter numbers may be counts.
 SECONDS_SINCE_1970 = 9
 
 
