@@ -9,7 +9,7 @@ from math import hypot, inf, sqrt
 import numpy as np
 
 from drivers.can_load import heartbeat_timeout
-from model.errors import Refused
+from model.errors import BadInput, Refused
 from model.files.rig_file import Cia402Document, OdriveDocument
 from model.kinematics import cables_to, structure_matrix_of
 from model.pose import Array, Pose
@@ -132,6 +132,8 @@ def stopping_remarks(
         clearance: Proved for the whole path, [m]; infinite without obstacles.
         margin: Smallest capacity margin of the path, [N].
     """
+    if clearance == inf:
+        return []
     positions = np.array([pose.position for pose in waypoints])
     rotations = np.array([pose.rotation for pose in waypoints])
     turns = bool(np.abs(rotations - rotations[0]).max() > 1e-6)
@@ -140,6 +142,9 @@ def stopping_remarks(
         require_stopping_room(rig, clearance, coasting, turns=turns)
     except Refused as refused:
         return [f"a run at {rig.motion.speed * 1000:.3g} mm/s may be refused: {refused.what}"]
+    except BadInput as error:  # a profile file of another computer or folder
+        why = str(error).partition("\n")[0]
+        return [f"whether a run can stop before obstacles is not checked: {why}"]
     return []
 
 

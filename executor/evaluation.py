@@ -100,21 +100,23 @@ def evaluate(
 ) -> EvaluatedRun:
     """Computes the verdict of a run and its tables.
 
-    First it has the end of the run and the camera poses written, which would be lost if the
-    program were killed during the evaluation of a long run.
+    First it has the end of the run, cycles that could not be appended, and the camera poses
+    written, which would be lost if the program were killed during the evaluation of a long run.
 
     Args:
         prepared: The run.
         outcome: Of the motion.
         seen: Camera records.
         course: Of the run, with its end.
-        recorder: Of the run; its cycles are written, or never will be.
+        recorder: Of the run; its cycles are appended, or never will be.
     """
     folder, take_file = recorder.folder, recorder.writer.take_file
-    lost = _lost_cycles(course, recorder.writer.unwritten)
-    course = replace(course, troubles=(*course.troubles, *lost))
     take_file(partial(_written, [(COURSE, partial(folder.write_end_of_course, course))]))
     cycles = outcome.log.table()
+    unwritten = recorder.writer.unwritten  # the disk may have recovered since
+    if unwritten and _written([(CYCLES, partial(folder.write_table, CYCLES, cycles))]):
+        troubles = (*course.troubles, *_lost_cycles(course, unwritten))
+        course = replace(course, troubles=troubles)
     poses = _pose_table(seen.together, cycles)
     alone = {name: _pose_table(samples, cycles) for name, samples in seen.alone.items()}
     if len(poses):
@@ -248,7 +250,7 @@ def write_end(
 
     Args:
         folder: Of the run.
-        course: With its end.
+        course: With its end, if there is no evaluation.
         result: The evaluation; None if it failed.
         events: All events.
         given_up: Called before each file that can be made from the others; True leaves it out.
@@ -256,8 +258,9 @@ def write_end(
     Returns:
         Names of the files that could not be written, and why.
     """
+    end = course if result is None else result.context.course
     files: list[_File] = [
-        (COURSE, partial(folder.write_end_of_course, course)),
+        (COURSE, partial(folder.write_end_of_course, end)),
         (EVENTS, partial(_complete_events, folder, events)),
     ]
     if result is not None:

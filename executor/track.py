@@ -248,17 +248,23 @@ def track_sources(
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
     for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
-        if check.count:
-            listener.remark(
-                f"camera {camera.name}: {check.count} images are exact copies of the one before and"
-                " were not measured: a recorder or converter repeats images instead of lost ones"
-            )
-        if isinstance(frames, LiveCamera) and frames.late:
-            listener.remark(
-                f"camera {camera.name}: {frames.late} images came late and were skipped, as it is"
-                " unknown how long they waited in the network or the computer"
-            )
+        late = frames.late if isinstance(frames, LiveCamera) else 0
+        for text in _not_measured(check.count, late):
+            listener.remark(f"camera {camera.name}: {text}")
     return result
+
+
+def _not_measured(copies: int, late: int) -> Iterator[str]:
+    """Why images of a camera were not measured, and how many."""
+    if copies:
+        are = "1 image is an exact copy" if copies == 1 else f"{copies} images are exact copies"
+        yield (
+            f"{are} of the one before and {'was' if copies == 1 else 'were'} not measured:"
+            " some recorders and converters repeat an image in place of a lost one"
+        )
+    if late:
+        were = "1 image came late and was" if late == 1 else f"{late} images came late and were"
+        yield f"{were} skipped, as the delay in the network or the computer is unknown"
 
 
 def _simultaneous(

@@ -19,7 +19,7 @@ from model.files.examples import (
     rig_text,
     select_examples,
 )
-from model.files.new_rig import RigQuestion, collect_answers, read_coordinates
+from model.files.new_rig import RigQuestion, collect_answers, read_coordinates, size_remarks
 from model.files.output import require_new_file
 from model.files.reading import ready_folder
 from model.rig import load_rig
@@ -115,12 +115,13 @@ def new(
     if coordinates is None:
         answers = collect_answers(output.stem, given, _ask, _refuse)
     else:
-        answers = collect_answers(output.stem, given | read_coordinates(coordinates))
+        given |= read_coordinates(coordinates)
+        answers = collect_answers(output.stem, given)
     write_atomic(output, rig_text(answers))
     name = shlex.quote(str(output))
     show_line(f"wrote {output}: {answers['cables']} cables")
     rig = load_rig(output)
-    Terminal().remarks(rig.document.remarks(), home_remarks(rig))
+    Terminal().remarks(size_remarks(given), rig.document.remarks(), home_remarks(rig))
     plan = f"cdpr plan {name} SCENE -o plan.json"
     show_line(f"next: review it, then cdpr doctor {name}, and with a scene {plan}")
 

@@ -19,6 +19,7 @@ from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import (
     IMAGE_LIMIT,
+    SECONDS_SINCE_1970,
     SPLIT,
     exif_orientation,
     files_in,
@@ -289,8 +290,8 @@ def _first(unused: Mapping[str, str]) -> str:
     return "; ".join(f"{name} {why}" for name, why in list(unused.items())[:4])
 
 
-#: Decimals at the end of a file's name, before its suffix.
-_DECIMALS = re.compile(r"(?<=\d\.)\d+(?=\.[^.]*$)")
+#: A number with a point at the end of a file's name, before its suffix.
+_DECIMALS = re.compile(r"(\d+)\.(\d+)(?=\.[^.]*$)")
 
 
 def natural_order(names: Iterable[str]) -> Callable[[str], tuple[list[tuple[int, int, str]], str]]:
@@ -302,7 +303,7 @@ def natural_order(names: Iterable[str]) -> Callable[[str], tuple[list[tuple[int,
     digits = _most_decimals(names)
 
     def key(name: str) -> tuple[list[tuple[int, int, str]], str]:
-        padded = _DECIMALS.sub(lambda decimals: decimals[0].ljust(digits, "0"), name.lower())
+        padded = _DECIMALS.sub(lambda two: f"{two[1]}.{two[2].ljust(digits, '0')}", name.lower())
         parts = re.split(r"(\d+)", padded)
         return [(1, int(p), "") if p.isdecimal() else (0, 0, p) for p in parts], name
 
@@ -312,13 +313,18 @@ def natural_order(names: Iterable[str]) -> Callable[[str], tuple[list[tuple[int,
 def _most_decimals(names: Iterable[str]) -> int:
     """The most decimals of numbers written without trailing zeros, as Python does; 0 for others.
 
-    Where dots separate counts, as in ``2.9`` and ``2.10``, some end in zero unless there are few,
-    and none begins with zero unless all have the same length.
+    Where dots separate counts, as in ``2.9`` and ``2.10``, some end in zero unless there are few or
+    every second was left out, only the shortest begin with zero, and the number before is usually
+    that of a recording: the same in all names, and shorter than seconds since 1970.
     """
-    decimals = [found[0] for name in names if (found := _DECIMALS.search(name))]
-    are_cut = not any(len(digits) > 1 and digits.endswith("0") for digits in decimals)
-    are_fine = any(re.match(r"0\d|\d{3}", digits) for digits in decimals)
-    return max(map(len, decimals)) if are_cut and are_fine else 0
+    found = [two.groups() for name in names if (two := _DECIMALS.search(name))]
+    wholes, decimals = {whole for whole, _ in found}, [digits for _, digits in found]
+    if any(len(digits) > 1 and digits.endswith("0") for digits in decimals):
+        return 0
+    shortest, most = min(map(len, decimals), default=0), max(map(len, decimals), default=0)
+    are_fractions = any(digits.startswith("0") and len(digits) > shortest for digits in decimals)
+    are_seconds = len(wholes) > 1 or any(len(whole) >= SECONDS_SINCE_1970 for whole in wholes)
+    return most if are_fractions or (are_seconds and most >= 3) else 0
 
 
 # Images written to a folder or into a video.

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from model.errors import BadInput, require_not_empty, sequence_of
-from model.files.reading import docs_page, is_folder
+from model.files.reading import SECONDS_SINCE_1970, docs_page, is_folder
 from model.progress import Listener
 from model.rig import Camera, Rig
 
@@ -373,8 +373,6 @@ _TWO_NUMBERS = re.compile(r"(.*?(\d+))(\D)(\d+)")
 #: A fraction of seconds has at least so many digits; with fewer than `_FINE` it may be a number of
 #: images, which rarely exceeds half of those that its digits can count.
 _COARSE, _FINE = 3, 6
-#: Seconds have at least so many digits unless a decimal point follows: others number recordings.
-_SECONDS_SINCE_1970 = 9
 
 
 def report_gap(names: Sequence[str], listener: Listener) -> None:
@@ -436,7 +434,7 @@ def _times_with_fraction(stems: Iterable[str]) -> list[int]:
     if len(named) < len(found) or not (are_even and are_fractions):
         return []
     seconds = [time // 1000 for time in _times_of_day(whole for whole, *_ in named)]
-    if not seconds and (are_decimals or all(len(n) >= _SECONDS_SINCE_1970 for _, n, *_ in named)):
+    if not seconds and (are_decimals or all(len(n) >= SECONDS_SINCE_1970 for _, n, *_ in named)):
         seconds = [int(number) for _, number, *_ in named]
     fine = [int(fraction.ljust(digits, "0")) for fraction in fractions]
     return [s * 10**digits + part for s, part in zip(seconds, fine, strict=False)]

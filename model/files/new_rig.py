@@ -241,6 +241,19 @@ def _box_of(anchors_mm: Sequence[Sequence[float]]) -> list[float]:
     return [math.ceil(10.0 * max(edge, 0.1 * max(edges))) / 10.0 for edge in edges.tolist()]
 
 
+def size_remarks(given: Answers) -> list[str]:
+    """Edges of the platform that `collect_answers` assumes, as the anchors hardly span them."""
+    if "platform_mm" in given or "anchors_mm" not in given:
+        return []
+    spans = np.ptp(given["anchors_mm"], axis=0)
+    return [
+        f"platform.size_mm: {size:g} mm along {axis} is assumed, as the anchors span {span:g} mm"
+        " there; measure the platform and correct it"
+        for axis, span, size in zip("xyz", spans, _box_of(given["anchors_mm"]), strict=True)
+        if span < 0.1 * max(spans)
+    ]
+
+
 def _geometry_problems(answers: Answers) -> list[str]:
     """What is wrong with platform, outlets and anchors, as far as they are answered."""
     known: dict[str, Any] = {
@@ -359,7 +372,7 @@ def collect_answers(
         BadInput: A given answer is invalid.
     """
     answers: dict[str, Any] = {"name": name}
-    if "anchors_mm" in given:  # the default
+    if "anchors_mm" in given and np.ptp(given["anchors_mm"], axis=0).any():  # the default
         answers["platform_mm"] = _box_of(given["anchors_mm"])
 
     def answer(question: RigQuestion, given: Answers = given) -> Any:

@@ -152,6 +152,10 @@ def is_folder(path: Path) -> bool:
         raise unreadable(path, error) from None
 
 
+#: Seconds since 1970 have at least so many digits in a name; shorter numbers may be counts.
+SECONDS_SINCE_1970 = 9
+
+
 def files_in(folder: Path) -> list[Path]:
     """What a folder contains.
 

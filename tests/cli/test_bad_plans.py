@@ -9,11 +9,13 @@ import pytest
 
 from model.plan import save_plan
 from model.rig import load_rig
-from model.scene import load_scene
+from model.scene import load_scene, scene_from_document
 from tests.cli.plans import (
     CONFIGS,
+    GOAL_MM,
     HALL,
     RIG,
+    START_MM,
     free_scene,
     rig_with_long_cycles,
     straight_plan,
@@ -134,3 +136,29 @@ def test_check_remarks_on_a_path_that_a_run_refuses_as_it_cannot_stop_before_obs
     assert ("may be refused: the path comes within" in checked.err) is refused
     ran = call("run", plan, "--fast", "--no-camera", "-o", tmp_path / "run")
     assert (ran.code == 3 and "without its master" in ran.err) is refused
+
+
+@pytest.mark.parametrize("profile", [None, "drives: {}\n"], ids=["missing", "invalid"])
+@pytest.mark.parametrize("with_obstacles", [True, False])
+def test_check_does_not_depend_on_the_file_of_the_drive_profile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, profile: str | None, with_obstacles: bool
+) -> None:
+    """The plan contains rig and scene; the profile's path is relative to the current folder."""
+    rig = tmp_path / "rig.yaml"
+    rig.write_text(f"{RIG.read_text()}\ndrives: {{type: cia402, profile: mine.yaml}}\n")
+    scene = free_scene(START_MM, GOAL_MM)
+    if not with_obstacles:
+        document = scene.document.model_copy(update={"obstacles": []})
+        scene = scene_from_document(document)
+    plan = tmp_path / "plan.json"
+    save_plan(straight_plan(load_rig(rig), scene, [START_MM, GOAL_MM]), plan)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    if profile is not None:
+        Path("mine.yaml").write_text(profile)
+    checked = call("check", plan)
+    assert checked.code == 0, checked
+    assert "passed" in checked.out
+    remark = "whether a run can stop before obstacles is not checked: "
+    assert (remark in checked.err) is ("mine.yaml:" in checked.err) is with_obstacles

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -528,7 +529,39 @@ def test_a_run_whose_last_cycles_are_not_on_record_fails_now_and_in_later_report
     assert call("report", run).code == 0
     summary = json.loads((run / "summary.json").read_text())
     assert summary["verdict"] == "FAILED"
-    assert any(lacking in reason for reason in summary["reasons"])
+    assert sum(lacking in reason for reason in summary["reasons"]) == 1
+    assert json.loads((run / "run.json").read_text())["troubles"] == [lacking]
+
+
+@pytest.mark.parametrize(
+    ("failing", "verdict"), [(2, "FAILED"), (-1, "PASSED")], ids=["during", "after the motion"]
+)
+def test_cycles_that_are_written_once_the_disk_has_recovered_are_on_record(
+    short_plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int, verdict: str
+) -> None:
+    """Only one write fails: during the motion the run stops, after it nothing is lost."""
+    append, calls = RunFolder.append_cycles, count(1)
+
+    def recovering(folder: RunFolder, text: str, *, fsync: bool) -> None:
+        is_rest = "cycle" not in text and text.count("\n") < 40
+        if next(calls) == failing or (failing < 0 and is_rest):
+            raise Fault("the run folder cannot be written", why="No space left on device")
+        append(folder, text, fsync=fsync)
+
+    monkeypatch.setattr(RunFolder, "append_cycles", recovering)
+    run = tmp_path / "run"
+    answer = call("run", short_plan, "--fast", "--no-camera", "-o", run)
+    assert answer.code == (0 if verdict == "PASSED" else 1)
+    assert "not on record" not in answer.said
+    course = json.loads((run / "run.json").read_text())
+    assert course["troubles"] == []
+    assert len(RunFolder.open(run).cycles()) == course["cycles"]
+    summaries = [json.loads((run / "summary.json").read_text())]
+    (run / "summary.json").unlink()
+    assert call("report", run).code == 0
+    summaries.append(json.loads((run / "summary.json").read_text()))
+    assert [one["verdict"] for one in summaries] == [verdict] * 2
+    assert "not on record" not in str(summaries)
 
 
 def test_a_working_folder_removed_after_the_motion_leaves_the_verdict(

@@ -379,3 +379,36 @@ def test_the_platform_is_the_box_of_the_anchors_where_only_they_are_known(tmp_pa
     half = 0.5 * np.array(load_rig(rig).document.platform.size_mm)
     assert (half >= np.abs(big).max(axis=0)).all()
     assert (half <= np.maximum(np.abs(big).max(axis=0), 0.1 * np.abs(big).max()) + 0.1).all()
+    assert "is assumed" not in answer.said
+
+
+def table_of_anchors(folder: Path, anchors: list[list[float]]) -> Path:
+    """The paper's outlets, with other anchors, [mm]."""
+    ends = zip(PAPER.document.outlets_mm, anchors, strict=True)
+    lines = [",".join(map(str, [*outlet, *anchor])) for outlet, anchor in ends]
+    (folder / "cables.csv").write_text("\n".join([",".join(CSV_COLUMNS), *lines]) + "\n")
+    return folder / "cables.csv"
+
+
+@pytest.mark.parametrize("size", [(), ("--platform-mm", "130", "130", "60")])
+def test_a_platform_edge_that_the_anchors_do_not_show_is_named(
+    tmp_path: Path, size: tuple[str, ...]
+) -> None:
+    flat = [[x, y, 0.0] for x, y, _ in PAPER.document.anchors_mm]
+    rig = tmp_path / "rig.yaml"
+    answer = call("new", rig, "--from", table_of_anchors(tmp_path, flat), *size)
+    assert answer.code == 0, answer
+    edges = load_rig(rig).document.platform.size_mm
+    remark = f"platform.size_mm: {edges[2]:g} mm along z is assumed, as the anchors span 0 mm there"
+    assert (remark in answer.said) is (not size)
+    assert answer.said.count("is assumed") == (not size)
+
+
+def test_anchors_at_one_point_are_named_where_the_platform_has_no_given_size(
+    tmp_path: Path,
+) -> None:
+    table = table_of_anchors(tmp_path, [[0.0, 0.0, 0.0]] * 8)
+    with nothing_written(tmp_path):
+        answer = call("new", tmp_path / "rig.yaml", "--from", table)
+    one_message(answer, 2, "anchors_mm: all 8 anchors are")
+    assert "platform.size_mm" not in answer.said

@@ -61,7 +61,12 @@ def test_a_folder_is_read_in_the_order_of_its_numbers(folder: Path, camera: Came
         ["1763000000.66704.png", "1763000000.699895.png", "1763000000.7.png", "1763000001.0.png"],
         ["cam2_999999999.9.png", "cam2_1000000000.66704.png", "cam2_1000000000.7.png"],
         ["0.0.png", "0.03.png", "0.07.png", "0.1.png", "0.13.png"],
-        ["1.5.png", "1.625.png", "1.75.png", "other.png"],
+        ["12.967.png", "13.0.png", "13.033.png", "other.png"],
+        ["1763000000.5.png", "1763000000.625.png", "1763000000.75.png"],
+        [f"cam1.{k}.png" for k in range(1, 160, 2)],
+        [f"cam1.{k:02}.png" for k in range(1, 160, 2)],
+        [f"seq3.{k}.jpg" for k in range(1, 300, 5)],
+        [f"a1.{k}.png" for k in (97, 98, 99, 101, 102)],
     ],
 )
 def test_images_are_in_the_order_of_their_numbers_or_times(
