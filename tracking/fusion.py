@@ -14,10 +14,10 @@ from itertools import combinations
 
 import numpy as np
 
+from model.cameras import Z_95
 from model.pose import Array, Pose, interpolate, moved, read_only, step_between
-from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
+from tracking.measurement import MEMORY, NoPose, Observation, PoseMeasurement, extrapolate
 from tracking.pose_log import LoggedImage
-from tracking.rolling_shutter import CLOCK_SAMPLE, ClockOffset, clock_offset, clock_sample
 
 #: Standard deviation of a camera's pose from lens, extrinsics and tags where not stated; always
 #: added when poses are compared, [m] and [rad].
@@ -27,6 +27,8 @@ UNSTATED_ERROR = np.array([0.5e-3] * 3 + [np.radians(0.05)] * 3)
 GATE = 27.9
 #: Part of the reason for a missing pose where two cameras contradict each other.
 DISAGREE = "disagree"
+#: Clocks are compared from this number of frame sets on.
+LEAST_FRAME_SETS = 10
 
 
 class MultiCameraFusion:
@@ -201,71 +203,74 @@ def _shared(poses: Sequence[PoseMeasurement], parts: Array) -> Array:
 
 
 class ClockComparison:
-    """Finds the offset between the clocks of two cameras, and its drift, from the motion.
+    """Finds the offset between the clocks of two cameras from the platform's motion.
 
-    Beside it, `clock_offset` fits errors of lens, extrinsics and tags: 0 within what the poses and
-    `UNSTATED_ERROR` state.
+    Their disagreement is fitted by an offset and a matrix times the position, for errors of lens,
+    extrinsics and tags (0 within what the poses and `UNSTATED_ERROR` state), plus a time times the
+    velocity, and a share of the change of velocity, to which an offset also leads.
     """
 
     def __init__(self, first: str, second: str) -> None:
         """Starts without poses of two cameras, given by name."""
         self._names = (first, second)
-        self._newest: list[tuple[PoseMeasurement, PoseMeasurement]] = []
-        self._samples: list[Array] = []
-        self._begin = 0.0
-        self._known = np.eye(12) / (2.0 * UNSTATED_ERROR[3] ** 2)
+        self._newest: deque[tuple[PoseMeasurement, PoseMeasurement]] = deque(maxlen=3)
+        self._start, self._prior = np.zeros(3), np.zeros((14, 14))
+        self._normal, self._sum, self._cost = np.zeros((14, 14)), np.zeros(14), 0.0
+        self._count, self._speed_2, self._speed_4 = 0, 0.0, 0.0
 
     def add(self, first: PoseMeasurement, second: PoseMeasurement) -> None:
-        """Adds the poses of a frame set; those within `CLOCK_SAMPLE` are averaged."""
-        if not self._newest:
-            stated = (first.shared + second.shared)[:3, :3] + 2.0 * np.diag(UNSTATED_ERROR[:3] ** 2)
-            self._known[:3, :3], self._begin = np.linalg.inv(stated), second.time
-        elif not all(
-            x.time < y.time for x, y in zip(self._newest[-1], (first, second), strict=True)
-        ):
-            return
-        elif first.time - self._newest[0][0].time >= CLOCK_SAMPLE:
-            self._samples.append(clock_sample(self._newest))
-            self._newest = []
+        """Adds the poses of a frame set; the velocity is that between its neighbours."""
         self._newest.append((first, second))
+        if len(self._newest) < 3:
+            return
+        before, (a, b), after = self._newest
+        spans = np.array([new.time - old.time for old, new in zip(before, after, strict=True)])
+        if not np.all((spans > 0.0) & (spans <= 2.0 * MEMORY)):
+            return
+        old, here, new = (np.array([one.pose.position for one in pair]) for pair in self._newest)
+        velocity = np.mean((new - old) / spans[:, None], axis=0)
+        second_difference = np.mean(new - 2.0 * here + old, axis=0)
+        if self._count == 0:
+            self._start = here[0]
+            stated = (a.shared + b.shared)[:3, :3] + 2.0 * np.diag(UNSTATED_ERROR[:3] ** 2)
+            self._prior[:3, :3] = np.linalg.inv(stated)
+            self._prior[3:12, 3:12] = np.eye(9) / (2.0 * UNSTATED_ERROR[3] ** 2)
+            self._prior[13, 13] = 1.0
+        gap = here[1] - here[0] - velocity * (b.time - a.time)
+        by_position = np.kron(np.eye(3), here[0] - self._start)
+        row = np.column_stack([np.eye(3), by_position, velocity, second_difference])
+        weighted = row.T @ np.linalg.inv((a.covariance + b.covariance)[:3, :3])
+        self._normal += weighted @ row
+        self._sum += weighted @ gap
+        self._cost += float(gap @ weighted[:3] @ gap)
+        self._count += 1
+        self._speed_2 += float(velocity @ velocity)
+        self._speed_4 += float(velocity @ velocity) ** 2
 
     def remark(self) -> str:
         """The offset and its effect; empty if it is not significant (3σ), or below 0.5 mm."""
-        if not self._newest:
+        if self._count < LEAST_FRAME_SETS or self._speed_2 == 0.0:
             return ""
-        first, second = self._names
-        samples = np.array([*self._samples, clock_sample(self._newest)])
-        ends = self._begin, self._newest[-1][1].time
-        drifting, steady = (
-            clock_offset(samples, self._known, ends, drifts=drifts) for drifts in (True, False)
-        )
-        if drifting is not None and drifting.shows((-1.0, 1.0), drifting.alone, UNSTATED_ERROR[0]):
-            begin, end = (
-                f"{drifting.text(k)} {'earlier' if round(late * 1e3) < 0 else 'later'}"
-                for k, late in enumerate(drifting.late)
-            )
-            return (
-                f"{self._effect(drifting, 'up to ')}: images of {second} are taken {begin} than"
-                f" those of {first} with the same time at the beginning, {end} at the end (95 %);"
-                " compare their frame rates and clocks, as latency_ms cannot correct a drift"
-            )
-        if steady is None or not steady.shows((1.0, 0.0), steady.covariance, UNSTATED_ERROR[0]):
+        scale, unknown = 1.0, np.ones((14, 14))
+        unknown[:3, :3] = 1e-4  # as if nothing were known about the cameras' poses
+        for _ in range(2):  # then with the scatter that the first fit leaves
+            covariance = np.linalg.inv(self._normal / scale + self._prior)
+            fit = covariance @ self._sum / scale
+            left = float(self._cost - 2.0 * fit @ self._sum + fit @ self._normal @ fit)
+            scale = max(1.0, left / (3.0 * self._count))
+        alone = np.linalg.inv(self._normal / scale + unknown * self._prior)
+        late, (sigma, sigma_alone) = fit[12], np.sqrt([covariance[12, 12], alone[12, 12]])
+        speed = np.sqrt(self._speed_4 / self._speed_2)
+        if abs(late) < 3.0 * sigma or abs(late) * speed < UNSTATED_ERROR[0]:
             return ""
-        earlier, later = (first, second) if steady.late[0] > 0.0 else (second, first)
-        certain = steady.shows((1.0, 0.0), steady.alone, UNSTATED_ERROR[0])
-        perhaps = "" if certain else "perhaps "
-        otherwise = "" if certain else ", and their poses at rest, as the velocity hardly changes"
+        earlier, later = self._names if late > 0.0 else self._names[::-1]
+        perhaps = "perhaps " if abs(late) < 3.0 * sigma_alone else ""
+        otherwise = ", and their poses at rest, as the velocity hardly changes" if perhaps else ""
         return (
-            f"{self._effect(steady)}: {perhaps}images of {later} are taken {steady.text(0)} (95 %)"
-            f" later than those of {earlier} with the same time; compare their clocks and"
-            f" latency_ms{otherwise}"
-        )
-
-    def _effect(self, offset: ClockOffset, up_to: str = "") -> str:
-        apart = float(np.abs(offset.late).max()) * offset.speed * 1e3
-        return (
-            f"cameras {' and '.join(self._names)} {DISAGREE} by {up_to}{apart:.1f} mm along the"
-            f" motion at {offset.speed * 1e3:.0f} mm/s"
+            f"cameras {' and '.join(self._names)} {DISAGREE} by {abs(late) * speed * 1e3:.1f} mm"
+            f" along the motion at {speed * 1e3:.0f} mm/s: {perhaps}images of {later} are taken"
+            f" {abs(late) * 1e3:.0f} ± {np.ceil(Z_95 * sigma * 1e3):.0f} ms (95 %) later than those"
+            f" of {earlier} with the same time; compare their clocks and latency_ms{otherwise}"
         )
 
 
