@@ -307,6 +307,22 @@ def test_slow_errors_of_the_encoders_are_no_wrong_scale(rig: Rig) -> None:
     assert found.issues == ()
 
 
+@pytest.mark.parametrize("seed", [100, 102, 103])
+def test_a_platform_that_only_translates_says_nothing_about_the_place_of_its_tags(
+    rig: Rig, seed: int
+) -> None:
+    """The errors of an uncalibrated rig's poses, which vary smoothly, look like rotations."""
+    images, encoder = session(rig, 30, 0.0, 1e-6, seed)
+    rng = np.random.default_rng(99 + seed)
+    shift, turn = (scale * rng.standard_normal((3, 3)) for scale in (0.02, 0.1))
+    poses = {}
+    for name, pose in encoder.items():
+        squares = (pose.position - [0.0, 0.0, 0.42]) ** 2
+        rotation = matrix_from_rotation_vector(turn @ squares) @ pose.rotation
+        poses[name] = Pose(pose.position + shift @ squares, rotation)
+    assert not locate_by_motion(rig, unaware(rig.cameras[0]), images, poses).is_contradictory
+
+
 def test_an_error_is_not_stated_as_what_is_required(rig: Rig) -> None:
     found = locate_by_motion(rig, rig.cameras[0], *session(rig, 16, 0.3, 3e-4, seed=18))
     for share in (0.9, 0.996, 0.99999):
