@@ -18,6 +18,7 @@ from scipy.special import chdtrc
 from calibration.geometry.calibrate import RigCalibration, workspace_poses
 from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE
 from calibration.geometry.model import RigModel
+from calibration.geometry.parameters import common_changes, deviation_text, option_of
 from calibration.results import CalibrationVerdict, Issue
 from calibration.statistics import CONFIDENCE
 from model.pose import Array
@@ -187,6 +188,16 @@ FAR = 5.0
 """Largest credible deviation from the rig file, in stated standard deviations."""
 SCATTERED = 2.0
 """Largest acceptable scatter of a sensor or of measured poses, in stated standard deviations."""
+_SCALE = (
+    "the scale of the measured positions: the tracker's units and reflector (--reflector-mm), the"
+    " camera matrix, size_mm of the tags"
+)
+"""What to check where the whole rig seems to be of another size."""
+_FRAME = (
+    "whether the measured poses are in the world frame of the rig file: the camera's pose, or the"
+    " tracker's frame"
+)
+"""What to check where outlets seem to have moved together."""
 _COMMON = (
     "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
     " --pose-mm and --pose-deg, in Python pose_deviations=: all measured poses share it, so more of"
@@ -262,8 +273,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    issues = _deviation_issues(result) + _stiffness_issues(result) + _tension_issues(result)
-    issues += _sensor_issues(result) + _pose_issues(result)
+    issues = _deviation_issues(result) + _common_issues(result) + _stiffness_issues(result)
+    issues += _tension_issues(result) + _sensor_issues(result) + _pose_issues(result)
     if missed > wanted:
         what = "samples" if out.poses else "cable lengths of samples"
         issues.append(
@@ -322,10 +333,10 @@ def _deviation_issues(result: RigCalibration) -> list[Issue]:
     if times[k] <= FAR:
         return []
     group = next(g for g, s in parameters.slices().items() if s.start <= k < s.stop)
-    option = f"--{group.replace('_', '-').removeprefix('cable-')}-{_UNITS.get(group, 'mm')}"
+    option = option_of(group)
     return [
         Issue(
-            f"{parameters.names[k]} is {_far(group, float(values[k]))},"
+            f"{parameters.names[k]} is {deviation_text(group, float(values[k]))},"
             f" {times[k]:.3g} times {option}",
             "check units, the order of the cables and the rig file; if it is truly that far"
             f" off, pass a larger {option}",
@@ -333,22 +344,27 @@ def _deviation_issues(result: RigCalibration) -> list[Issue]:
     ]
 
 
-_UNITS = {
-    **dict.fromkeys(("drum_scale", "stiffness", "cable_stiffness"), "percent"),
-    **dict.fromkeys(("swivel_zeros", "imu_mounting"), "deg"),
-}
-"""Unit in the option of a group; mm for the others."""
-
-
-def _far(group: str, value: float) -> str:
-    """Deviation from the rig file as text; of a stiffness it is the logarithm."""
-    if _UNITS.get(group) == "deg":
-        return f"{math.degrees(abs(value)):.3g}°"
-    if group in ("stiffness", "cable_stiffness"):
-        return f"{math.exp(value):.3g} times that of the rig file, as a logarithm"
-    if group == "drum_scale":
-        return f"{abs(value) * 1e2:.3g} % from the rig file"
-    return f"{abs(value) * 1e3:.3g} mm from the rig file"
+def _common_issues(result: RigCalibration) -> list[Issue]:
+    """Issues for changes that outlets and drums share, which residuals do not show."""
+    found = result.uncertainty
+    covariance = found.by_scatter + found.common @ found.common.T
+    changes, covariance = common_changes(result.parameters, result.fit.values, covariance)
+    scale, sizes = changes[6] * 1e2, [float(np.linalg.norm(changes[k : k + 3])) for k in (0, 3)]
+    compared = f"{abs(scale):.2g} % {'larger' if scale > 0.0 else 'smaller'}"
+    cases = (
+        (slice(6, 7), f"outlets and drums give a rig {compared} than its file", _SCALE),
+        (slice(3, 6), f"all outlets are rotated together by {math.degrees(sizes[1]):.2g}°", _FRAME),
+        (slice(0, 3), f"all outlets are displaced together by {sizes[0] * 1e3:.3g} mm", _FRAME),
+    )
+    issues = []
+    for part, what, check in cases:
+        own = changes[part]
+        times = math.sqrt(own @ np.linalg.solve(covariance[part, part], own))
+        if times > FAR:
+            reason = f"{what}, {times:.3g} standard deviations"
+            step = f"check {check}; if the rig file is truly that far off, pass a larger"
+            issues.append(Issue(reason, f"{step} {option_of('outlets')}"))
+    return issues
 
 
 def _stiffness_issues(result: RigCalibration) -> list[Issue]:

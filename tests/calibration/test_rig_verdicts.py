@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import tension_variance
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS
 from calibration.geometry.quality import judge_rig
+from model.pose import matrix_from_rotation_vector
 from model.rig import Rig, load_rig
 from tests.calibration.rig_places import (
     rig_with_errors,
@@ -61,6 +63,42 @@ def as_in_its_file(rig: Rig) -> BuiltRig:
     """A rig that was calibrated before."""
     off = built_rig(rig, 0).off
     return BuiltRig(rig, {group: np.zeros_like(values) for group, values in off.items()})
+
+
+def with_moved_poses(data: RigMeasurements, factor: float, turn: float) -> RigMeasurements:
+    """The measurements with a wrong scale and frame, about the middle of the positions."""
+    middle, rotation = data.positions.mean(axis=0), matrix_from_rotation_vector([turn, 0.0, 0.0])
+    positions = middle + factor * (data.positions - middle) @ rotation.T
+    return replace(data, positions=positions, rotations=rotation @ data.rotations)
+
+
+@pytest.mark.parametrize(
+    ("factor", "turn", "reason", "check"),
+    [
+        (
+            0.99,
+            0.0,
+            r"a rig (1|0\.\d+) % smaller than its file",
+            "the scale of the measured positions",
+        ),
+        (1.01, 0.0, r"a rig (1|0\.\d+) % larger than its file", "size_mm"),
+        (1.0, 0.01, r"all outlets are rotated together by 0\.\d+°", "the world frame"),
+    ],
+)
+def test_measured_positions_of_a_wrong_scale_or_frame_are_not_good_enough(
+    rig: Rig, factor: float, turn: float, reason: str, check: str
+) -> None:
+    """Residuals do not show it: the robot would be worse than with its file."""
+    data = only(measured(built_rig(rig, 3), 40, 3))
+    wrong = judge_rig(calibrated(rig, with_moved_poses(data, factor, turn)), 1e-2, TILT).verdict
+    assert any(re.search(reason, why) for why in wrong.reasons), wrong.reasons
+    assert any(check in step for step in wrong.next_steps)
+
+
+def test_errors_of_the_rig_file_as_stated_are_not_those_of_the_measured_poses(rig: Rig) -> None:
+    data = only(measured(built_rig(rig, 3), 40, 3))
+    reasons = judge_rig(calibrated(rig, data), 1e-2, TILT).verdict.reasons
+    assert not [why for why in reasons if "than its file" in why or "together" in why]
 
 
 @pytest.mark.parametrize("seed", [1, 2])
