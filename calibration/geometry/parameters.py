@@ -1,4 +1,4 @@
-"""Parameters of a rig that a calibration estimates, in named groups, and their priors."""
+"""Parameters of a rig that a calibration estimates, their priors, and changes from the rig file."""
 
 from __future__ import annotations
 
@@ -239,3 +239,60 @@ def common_changes(parameters: Parameters, values: Array, covariance: Array) -> 
     weighted = np.linalg.solve(whole, slopes[rows])
     spread = np.linalg.inv(slopes[rows].T @ weighted)
     return spread @ weighted.T @ values[rows], spread
+
+
+CONTRADICTION = 4.0
+"""This many standard deviations from the rig file are significant."""
+LEAST_CHANCE = 1e-3
+"""Cables differ if chance explains the differences with a lower probability."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compliance:
+    """Estimate of the cables' compliance, 1 / stiffness; of the mean if they differ.
+
+    Attributes:
+        nominal: Of the rig file, to first order about the fit, [1/N].
+        estimated: From the data, [1/N].
+        deviation: Standard deviation of the difference, [1/N].
+    """
+
+    nominal: float
+    estimated: float
+    deviation: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the data contradict the rig file."""
+        return abs(self.estimated - self.nominal) > CONTRADICTION * self.deviation
+
+    def __str__(self) -> str:
+        """The estimated stiffness as text."""
+        if self.estimated > 0.0:
+            return f"about {1.0 / self.estimated:.2g} N"
+        return "too high to determine"
+
+
+@dataclass(frozen=True, slots=True)
+class CableCompliances:
+    """Estimate of each cable's own compliance.
+
+    Attributes:
+        estimated: Shape (m,), [1/N].
+        chance: Probability of such differences by chance (p-value).
+    """
+
+    estimated: Array
+    chance: float
+
+    @property
+    def contradict(self) -> bool:
+        """Whether one compliance for all cables does not explain the data."""
+        return self.chance < LEAST_CHANCE
+
+    def __str__(self) -> str:
+        """The estimated stiffnesses as text."""
+        estimated = (
+            f"{1.0 / c:.2g} N" if c > 0.0 else "too high to determine" for c in self.estimated
+        )
+        return ", ".join(estimated)

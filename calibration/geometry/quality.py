@@ -18,66 +18,16 @@ from scipy.special import chdtrc
 from calibration.geometry.calibrate import RigCalibration, workspace_poses
 from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE
 from calibration.geometry.model import RigModel
-from calibration.geometry.parameters import common_changes, deviation_text, option_of
-from calibration.results import CalibrationVerdict, Issue
+from calibration.geometry.parameters import (
+    CableCompliances,
+    Compliance,
+    common_changes,
+    deviation_text,
+    option_of,
+)
+from calibration.results import CalibrationVerdict, Issue, beyond
 from calibration.statistics import CONFIDENCE
 from model.pose import Array
-
-CONTRADICTION = 4.0
-"""This many standard deviations from the rig file are significant."""
-LEAST_CHANCE = 1e-3
-"""Cables differ if chance explains the differences with a lower probability."""
-
-
-@dataclass(frozen=True, slots=True)
-class Compliance:
-    """Estimate of the cables' compliance, 1 / stiffness; of the mean if they differ.
-
-    Attributes:
-        nominal: Of the rig file, to first order about the fit, [1/N].
-        estimated: From the data, [1/N].
-        deviation: Standard deviation of the difference, [1/N].
-    """
-
-    nominal: float
-    estimated: float
-    deviation: float
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether the data contradict the rig file."""
-        return abs(self.estimated - self.nominal) > CONTRADICTION * self.deviation
-
-    def __str__(self) -> str:
-        """The estimated stiffness as text."""
-        if self.estimated > 0.0:
-            return f"about {1.0 / self.estimated:.2g} N"
-        return "too high to determine"
-
-
-@dataclass(frozen=True, slots=True)
-class CableCompliances:
-    """Estimate of each cable's own compliance.
-
-    Attributes:
-        estimated: Shape (m,), [1/N].
-        chance: Probability of such differences by chance (p-value).
-    """
-
-    estimated: Array
-    chance: float
-
-    @property
-    def contradict(self) -> bool:
-        """Whether one compliance for all cables does not explain the data."""
-        return self.chance < LEAST_CHANCE
-
-    def __str__(self) -> str:
-        """The estimated stiffnesses as text."""
-        estimated = (
-            f"{1.0 / c:.2g} N" if c > 0.0 else "too high to determine" for c in self.estimated
-        )
-        return ", ".join(estimated)
 
 
 def estimate_compliance(result: RigCalibration) -> Compliance | None:
@@ -279,7 +229,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         what = "samples" if out.poses else "cable lengths of samples"
         issues.append(
             Issue(
-                f"errors of held-out {what} reach {missed * 1e3:.2g} mm",
+                f"errors of held-out {what} reach {beyond(missed, wanted)}",
                 "calibrate the camera and its pose, and check for worn guides, slack cables, errors"
                 " of measured tensions and outliers in the report's list of poses",
             )
@@ -296,7 +246,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     if level > wanted:
         issues.append(
             Issue(
-                f"the platform may be {level * 1e3:.2g} mm off between the measured poses",
+                f"between the measured poses, the platform may be off by {beyond(level, wanted)}",
                 _shared_cause(level, *level_parts)
                 or "measure at more poses all over the workspace"
                 + ("" if out.poses else ", and with a camera"),
@@ -305,7 +255,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     if rotated > max(wanted, level):
         issues.append(
             Issue(
-                f"rotated by {math.degrees(tilt):.3g}° it may be {rotated * 1e3:.2g} mm off",
+                f"rotated by {math.degrees(tilt):.3g}°, the platform may be off by"
+                f" {beyond(rotated, wanted)}",
                 _shared_cause(rotated, *rotated_parts)
                 or f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
                 " (`cdpr calibrate poses` plans it); if it never rotates, pass --tilt-deg 0, in"

@@ -337,7 +337,7 @@ def test_rotations_in_other_columns_are_refused_with_those_to_give(
     path = tmp_path / "samples.csv"
     head = f"actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,{names}"
     path.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
-    with pytest.raises(BadInput, match="is of a rotation, but .*qw, qx, qy, qz") as caught:
+    with pytest.raises(BadInput, match=r"is of a rotation, but .*qw, qx, qy, qz") as caught:
         read_rig_data(path, 2)
     assert caught.value.next_step.startswith("give rotations as unit quaternions qw, qx, qy, qz")
     path.write_text("actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,rate_z,ry\n1,1,1,1,1,1,1\n")

@@ -111,6 +111,16 @@ def test_a_rig_as_in_its_file_passes_and_keeps_the_file(rig: Rig, seed: int) -> 
     assert quality.verdict.next_steps[0].startswith("keep the rig file")
 
 
+def test_an_error_just_beyond_the_required_one_is_not_stated_as_equal_to_it(rig: Rig) -> None:
+    """Not "1 mm off" as the reason why 1 mm is not met."""
+    result = fit_rig(rig, only(measured(as_in_its_file(rig), 30, 1)), DEFAULT_DEVIATIONS, 1e-4)
+    quality = judge_rig(result, 1.0, TILT)
+    missed = float(np.quantile(result.held_out.after, 0.95))
+    for error in (missed, quality.level, quality.rotated):
+        reasons = judge_rig(result, error * 0.9999, TILT).verdict.reasons
+        assert any("just over " in why for why in reasons), reasons
+
+
 def test_a_calibration_that_is_worse_than_it_states_is_refused(rig: Rig) -> None:
     """Held-out samples contradict it by more than its interval."""
     data = only(measured(as_in_its_file(rig), 30, 1))
