@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.geometry.calibrate import RigCalibration, workspace_poses
+from calibration.geometry.calibrate import MOST_SCATTER, RigCalibration, workspace_poses
 from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE
 from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import (
@@ -145,9 +145,14 @@ _SCALE = (
 """What to check where the whole rig seems to be of another size."""
 _FRAME = (
     "whether the measured poses are in the world frame of the rig file: the camera's pose, or the"
-    " tracker's frame"
+    " tracker's frame and reflector (--reflector-mm)"
 )
 """What to check where outlets seem to have moved together."""
+CHECK_POSES = (
+    "the measured poses (positions of the platform's origin, or of the point that --reflector-mm,"
+    " in Python reflector=, states; qw first, by world_from_platform; in the rows of their counts)"
+)
+"""What to check where measured poses contradict the cables grossly."""
 _COMMON = (
     "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
     " --pose-mm and --pose-deg, in Python pose_deviations=: all measured poses share it, so more of"
@@ -388,14 +393,16 @@ def _sensor_issues(result: RigCalibration) -> list[Issue]:
 
 def _pose_issues(result: RigCalibration) -> list[Issue]:
     """An issue for measured positions or rotations that scatter more than stated."""
+    by_camera = bool(result.rig.cameras)
+    causes = ["the camera's lens, the layout of the tags"] if by_camera else []
+    if not by_camera or result.pose_scales.max() > MOST_SCATTER:
+        causes.insert(0, CHECK_POSES)
+    step = (
+        f"check {', '.join(causes)} and the stated errors of the poses, or pass a larger --pose-mm"
+        " or --pose-deg, in Python pose_deviations="
+    )
     return [
-        Issue(
-            f"the measured {what} scatter {times:.3g} times as much as stated",
-            "check the camera's lens, the layout of the tags and the stated errors of the poses, or"
-            f" pass a larger --pose-{unit}, in Python pose_deviations=",
-        )
-        for what, times, unit in zip(
-            ("positions", "rotations"), result.pose_scales, ("mm", "deg"), strict=True
-        )
+        Issue(f"the measured {what} scatter {times:.3g} times as much as stated", step)
+        for what, times in zip(("positions", "rotations"), result.pose_scales, strict=True)
         if times > SCATTERED
     ]

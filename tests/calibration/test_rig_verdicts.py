@@ -111,6 +111,30 @@ def test_a_rig_as_in_its_file_passes_and_keeps_the_file(rig: Rig, seed: int) -> 
     assert quality.verdict.next_steps[0].startswith("keep the rig file")
 
 
+@pytest.mark.parametrize("mistake", ["reflector", "inverse", "late"])
+def test_measured_poses_that_cannot_be_right_are_named_with_their_columns(
+    rig: Rig, mistake: str
+) -> None:
+    """The camera's lens, or more poses, do not cure them."""
+    data = only(measured(built_rig(rig, 3), 25, 3))
+    if mistake == "reflector":
+        wrong = replace(data, positions=data.positions + data.rotations @ [0.0, 0.0, 0.22])
+    elif mistake == "inverse":
+        wrong = replace(data, rotations=np.swapaxes(data.rotations, 1, 2))
+    else:
+        rows = np.roll(np.arange(len(data)), 1)
+        wrong = replace(data, positions=data.positions[rows], rotations=data.rotations[rows])
+    (step,) = [
+        step
+        for step in judge_rig(calibrated(rig, wrong), 1e-3, TILT).verdict.next_steps
+        if "qw first" in step
+    ]
+    assert "--reflector-mm" in step
+    assert "world_from_platform" in step
+    assert "rows of their counts" in step
+    assert "lens" not in step
+
+
 def test_an_error_just_beyond_the_required_one_is_not_stated_as_equal_to_it(rig: Rig) -> None:
     """Not "1 mm off" as the reason why 1 mm is not met."""
     result = fit_rig(rig, only(measured(as_in_its_file(rig), 30, 1)), DEFAULT_DEVIATIONS, 1e-4)
