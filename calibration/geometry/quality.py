@@ -139,13 +139,13 @@ FAR = 5.0
 SCATTERED = 2.0
 """Largest acceptable scatter of a sensor or of measured poses, in stated standard deviations."""
 _SCALE = (
-    "the scale of the measured positions: the tracker's units and reflector (--reflector-mm), the"
-    " camera matrix, size_mm of the tags"
+    "the scale of the measured positions: the tracker's units and reflector (--reflector-mm, in"
+    " Python reflector=), the camera matrix, size_mm of the tags"
 )
 """What to check where the whole rig seems to be of another size."""
 _FRAME = (
     "whether the measured poses are in the world frame of the rig file: the camera's pose, or the"
-    " tracker's frame and reflector (--reflector-mm)"
+    " tracker's frame and reflector (--reflector-mm, in Python reflector=)"
 )
 """What to check where outlets seem to have moved together."""
 CHECK_POSES = (
@@ -318,8 +318,11 @@ def _common_issues(result: RigCalibration) -> list[Issue]:
         times = math.sqrt(own @ np.linalg.solve(covariance[part, part], own))
         if times > FAR:
             reason = f"{what}, {times:.3g} standard deviations"
-            step = f"check {check}; if the rig file is truly that far off, pass a larger"
-            issues.append(Issue(reason, f"{step} {option_of('outlets')}"))
+            step = (
+                f"check {check}; if the rig file is truly that far off, pass a larger --outlets-mm,"
+                " in Python outlets in deviations="
+            )
+            issues.append(Issue(reason, step))
     return issues
 
 
