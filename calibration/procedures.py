@@ -13,7 +13,7 @@ from calibration.extrinsics.result import ExtrinsicsOutcome, judged_extrinsics
 from calibration.extrinsics.surveyed_tags import Survey, locate_by_frame_tags, require_frame_tags
 from calibration.geometry.calibrate import RigCalibration, fit_rig
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, checked_deviations
-from calibration.geometry.quality import RigQuality, judge_rig
+from calibration.geometry.quality import CHECK_POSES, RigQuality, judge_rig
 from calibration.geometry.report import rig_page
 from calibration.geometry.result import RigResult, rig_result
 from calibration.images import (
@@ -418,7 +418,7 @@ def calibrate_rig(
                 where=", ".join(map(str, paths)),
                 why=error.what,
                 next_step="check units, the sign of the counts (`direction` of the winches), the"
-                " order of the cables, the homing of the drives and the rig file",
+                f" order of the cables, the homing of the drives, the rig file, and {CHECK_POSES}",
             ) from error
     page, facts = rig_page(found, quality, name, result.date), quality.facts(found)
     return Calibration(result, page, found, quality, facts).saved_in(to.folder)

@@ -248,6 +248,93 @@ def poses_near(
     return positions, rotations, np.max(np.abs(residuals), axis=1)
 
 
+_FIRST_DAMPING, _MOST_DAMPING = 1e3, 1e9
+"""Relative; the first steps are short, so that the poses found are those nearest downhill."""
+_MOST_STEPS = 300
+
+
+def settled_poses_near(
+    rig: Rig, lengths: Array, positions: Array, rotations: Array, *, tolerance: float = 1e-10
+) -> tuple[Array, Array]:
+    """Forward kinematics as by `poses_near`, of lengths that may contradict each other.
+
+    Where they do by millimetres, undamped steps run past the least squares and do not settle.
+    Steps here are damped for each pose, and taken only if they lower its squares.
+
+    Args:
+        rig: The robot, with point exits or pulleys.
+        lengths: Shape (n, m), [m].
+        positions: Guesses, world frame, shape (n, 3), [m].
+        rotations: Guesses, ``world_from_platform``, shape (n, 3, 3).
+        tolerance: Size of the last step at which the search ends, [m] and [rad].
+
+    Returns:
+        Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
+
+    Raises:
+        NoCable: At a guess a cable has no path.
+    """
+    here: tuple[Array, ...] = (positions, rotations)
+    here += _squares_near(rig, lengths, positions, rotations)
+    damping = np.full(len(lengths), _FIRST_DAMPING)
+    for _ in range(_MOST_STEPS):
+        positions, rotations, squares, slopes, normal = here
+        diagonal = damping[:, None] * np.abs(np.einsum("nii->ni", normal))
+        damped = normal + diagonal[:, None, :] * np.eye(6)
+        twists = -np.linalg.solve(damped, slopes[..., None])[..., 0]
+        turns = np.reshape([matrix_from_rotation_vector(v) for v in twists[:, 3:]], (-1, 3, 3))
+        ahead: tuple[Array, ...] = (positions + twists[:, :3], turns @ rotations)
+        exists = cables_exist(rig, _anchors_at(rig, *ahead))
+        ahead = _chosen(exists, ahead, here)
+        ahead += _squares_near(rig, lengths, *ahead)
+        better = exists & (ahead[2] <= squares)
+        here = _chosen(better, ahead, here)
+        damping = np.clip(damping * np.where(better, 0.5, 10.0), LEAST_DAMPING, _MOST_DAMPING)
+        if np.abs(twists).max(initial=0.0) < tolerance:
+            break
+    return here[0], here[1]
+
+
+def _anchors_at(rig: Rig, positions: Array, rotations: Array) -> Array:
+    """Anchors at n poses, world frame, shape (n, m, 3), [m]."""
+    return np.asarray(positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors))
+
+
+def _chosen(
+    first: NDArray[np.bool_], one: tuple[Array, ...], other: tuple[Array, ...]
+) -> tuple[Array, ...]:
+    """Arrays with a row per pose, each row of one of two; ``first`` shape (n,)."""
+    return tuple(
+        np.where(first.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+        for a, b in zip(one, other, strict=False)
+    )
+
+
+def _squares_near(
+    rig: Rig, lengths: Array, positions: Array, rotations: Array
+) -> tuple[Array, Array, Array]:
+    """Squares of the errors of cable lengths, half their gradient by twists, and its slopes.
+
+    Second derivatives of the lengths count, since errors of lengths that contradict each other
+    remain. Those of pulleys are taken as those of points: it does not change where steps end.
+
+    Returns:
+        Shapes (n,), (n, 6) and (n, 6, 6).
+    """
+    cables = cables_to(rig, _anchors_at(rig, positions, rotations))
+    matrices, errors = structure_matrix_of(cables, positions), cables.lengths - lengths
+    arms, shares = cables.anchors - positions[:, None, :], errors / cables.lengths
+    by_twist = np.zeros((*arms.shape, 6))
+    by_twist[..., :3], by_twist[..., 3:] = np.eye(3), np.cross(arms[..., None, :], np.eye(3))
+    normal = (matrices * (1.0 - shares[:, None, :])) @ np.swapaxes(matrices, 1, 2)
+    normal += np.einsum("nm,nmki,nmkj->nij", shares, by_twist, by_twist)
+    mixed = np.einsum("nm,nmi,nmj->nij", errors, cables.directions, arms)
+    traces = np.einsum("nii->n", mixed)[:, None, None]
+    normal[:, 3:, 3:] += traces * np.eye(3) - (mixed + np.swapaxes(mixed, 1, 2)) / 2.0
+    slopes = -(matrices @ errors[:, :, None])[:, :, 0]
+    return np.sum(errors**2, axis=1), slopes, normal
+
+
 def interpolate_quaternions(starts: Array, ends: Array, fractions: Array) -> Array:
     """Unit quaternions (w, x, y, z) between n pairs of nearby ones, shape (n, 4).
 

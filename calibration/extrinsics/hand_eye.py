@@ -360,7 +360,7 @@ def _consistency(
     offset = step_between(_NOMINAL, fit.platform_from_tags)
     allowed = np.hypot(np.repeat(TAG_FRAME_DEVIATION, 3), deviations[6:12])
     turns = [step_between(_NOMINAL, one.world_from_platform)[3:] for one in samples]
-    if np.linalg.norm(np.std(turns, axis=0)) < 10.0 * fit.noise[1]:  # too little to place it
+    if np.linalg.norm(np.std(turns, axis=0)) < 10.0 * fit.noise[1]:  # too little to locate it
         allowed[:3] = np.inf
     if (np.abs(offset) > _SIGNIFICANT * allowed).any():
         issues.append(_frame_issue(offset))

@@ -26,7 +26,7 @@ from calibration.geometry.model import RigModel
 from calibration.geometry.parameters import Parameters, RigGeometry, rig_with
 from calibration.statistics import Interval
 from model.errors import BadInput
-from model.kinematics import cables_to, poses_near
+from model.kinematics import cables_to, settled_poses_near
 from model.pose import Array, matrix_from_rotation_vector, read_only
 from model.rig import Rig
 from model.statics.gravity import working_tensions
@@ -244,7 +244,7 @@ class RigCalibration:
         there = _sent_to(self.rig, positions, rotations)
         lengths = RigModel(self.parameters, there).counted.lengths(self.geometry)
         rig = rig_with(self.rig, self.geometry)
-        return poses_near(rig, lengths, positions, rotations, steps=10)[0]
+        return settled_poses_near(rig, lengths, positions, rotations)[0]
 
 
 def fit_rig(

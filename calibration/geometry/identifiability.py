@@ -16,7 +16,7 @@ from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import RigModel, tension_variance
 from calibration.geometry.parameters import AXES, Parameters, rig_with
 from calibration.statistics import huber_weight, rms_bound, student_factor
-from model.kinematics import poses_near
+from model.kinematics import settled_poses_near
 from model.pose import Array, read_only, skew
 
 LEAST_INFORMATION = 1.0
@@ -439,6 +439,6 @@ def _errors(parameters: Parameters, values: Array, measured: RigMeasurements, po
         apart = model.residuals(values, *found)[:, : rig.cable_count]
         return np.asarray(np.sqrt(np.mean(apart**2, axis=1)))
     rotations = measured.first_rotations(rig)
-    found = poses_near(rig, lengths, measured.origins(rotations), rotations, steps=8)[:2]
+    found = settled_poses_near(rig, lengths, measured.origins(rotations), rotations)
     apart = measured.measured_points(*found) - measured.positions
     return np.asarray(np.linalg.norm(apart, axis=1))

@@ -321,6 +321,8 @@ def _mean_pose(run: Recording, pictures: NDArray[np.bool_]) -> tuple[Array, Arra
 _POSITION = ("x_mm", "y_mm", "z_mm")
 _ROTATION = ("qw", "qx", "qy", "qz")
 _DEVIATIONS = ("std_x_mm", "std_y_mm", "std_z_mm", "std_rx_deg", "std_ry_deg", "std_rz_deg")
+_ANGLES = r"(std[\W_]*)?(r(ot)?[\W_]*[xyz]|roll|pitch|yaw)([\W_]*(deg|rad)\w*\W*)?"
+"""Names of columns of rotations about axes, which are not read, and of their deviations."""
 _TO_SI = np.array([1e-3, 1e-3, 1e-3, *([float(np.radians(1.0))] * 3)])
 
 
@@ -354,6 +356,8 @@ def read_rig_data(path: Path, cables: int, reflector: Array | None = None) -> Ri
         positions = table.of(_POSITION) / 1e3
     if rotated:
         rotations = _rotations(table)
+    else:
+        _require_no_angles(table)
     if _has(table, "std_.*"):
         stated = _DEVIATIONS if np.isfinite(rotations).all() else _DEVIATIONS[:3]
         deviations[:, : len(stated)] = table.of(stated) * _TO_SI[: len(stated)]
@@ -382,6 +386,17 @@ def _has(table: CsvTable, names: str, units: str = "") -> bool:
     """
     pattern = rf"({names})([\W_]*({units})\W*)?"
     return any(re.fullmatch(pattern, name, re.IGNORECASE) for name in table.names)
+
+
+def _require_no_angles(table: CsvTable) -> None:
+    """Refuses rotations in other columns than a quaternion's, or their deviations alone."""
+    names = [n for n in table.names if re.fullmatch(_ANGLES, n, re.IGNORECASE)]
+    if names:
+        raise table.bad(
+            f"column {names[0]!r} is of a rotation, but there are no columns qw, qx, qy, qz",
+            "give rotations as unit quaternions qw, qx, qy, qz of world_from_platform, or leave out"
+            f" {', '.join(names)} to calibrate by positions alone",
+        )
 
 
 def _require_increasing(table: CsvTable) -> None:

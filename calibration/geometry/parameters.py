@@ -1,10 +1,10 @@
-"""Parameters of a rig that a calibration estimates, in named groups, and their priors."""
+"""Parameters of a rig that a calibration estimates, their priors, and changes from the rig file."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import radians
 from types import MappingProxyType
 
 import numpy as np
@@ -34,7 +34,7 @@ DEFAULT_DEVIATIONS: Mapping[str, float] = MappingProxyType(
         "drum_scale": 0.005,
         "offsets": 2e-3,
         "stiffness": 0.2,
-        "swivel_zeros": radians(1.0),
+        "swivel_zeros": math.radians(1.0),
     }
 )
 """Standard deviation of a rig file's values: [m], [rad]; drum_scale and stiffness are relative."""
@@ -183,3 +183,116 @@ def rig_with(rig: Rig, geometry: RigGeometry) -> Rig:
         pulley_radius=geometry.pulley_radius,
         cable_stiffness=geometry.stiffness,
     )
+
+
+_UNITS = {
+    **dict.fromkeys(("drum_scale", "stiffness", "cable_stiffness"), "percent"),
+    **dict.fromkeys(("swivel_zeros", "imu_mounting"), "deg"),
+}
+"""Unit in the option of a group; mm for the others."""
+
+
+def option_of(group: str) -> str:
+    """Option of `cdpr calibrate rig` with the standard deviation of a group."""
+    return f"--{group.replace('_', '-').removeprefix('cable-')}-{_UNITS.get(group, 'mm')}"
+
+
+def deviation_text(group: str, value: float) -> str:
+    """Deviation from the rig file as text; of a stiffness it is the logarithm."""
+    if _UNITS.get(group) == "deg":
+        return f"{math.degrees(abs(value)):.3g}°"
+    if group in ("stiffness", "cable_stiffness"):
+        return f"{math.exp(value):.3g} times that of the rig file, as a logarithm"
+    if group == "drum_scale":
+        return f"{abs(value) * 1e2:.3g} % from the rig file"
+    return f"{abs(value) * 1e3:.3g} mm from the rig file"
+
+
+def common_changes(parameters: Parameters, values: Array, covariance: Array) -> tuple[Array, Array]:
+    """Displacement, rotation and growth that the outlets share, the latter with the drums.
+
+    Measured positions with a wrong scale or in another frame change a rig in this way.
+
+    Args:
+        parameters: The unknowns.
+        values: Of the unknowns, shape (p,).
+        covariance: Of the values, without that of the rig file, shape (p, p).
+
+    Returns:
+        The best fit, shape (7,), [m], [rad] and relative, and its covariance, shape (7, 7); by
+        independent errors of the rig file and those of the values. 0 without outlets.
+    """
+    slices, rig = parameters.slices(), parameters.rig
+    if "outlets" not in slices:
+        return np.zeros(7), np.eye(7)
+    centred = rig.outlets - rig.outlets.mean(axis=0)
+    slopes = np.zeros((len(parameters), 7))
+    of_outlets = np.zeros((*centred.shape, 7))
+    of_outlets[..., :3] = np.eye(3)
+    of_outlets[..., 3:6] = np.swapaxes(np.cross(np.eye(3), centred[:, None]), 1, 2)
+    of_outlets[..., 6] = centred
+    slopes[slices["outlets"]] = of_outlets.reshape(-1, 7)
+    if "drum_scale" in slices:
+        slopes[slices["drum_scale"], 6] = 1.0
+    rows = slopes.any(axis=1)
+    whole = covariance[np.ix_(rows, rows)] + np.diag(parameters.deviations[rows] ** 2)
+    weighted = np.linalg.solve(whole, slopes[rows])
+    spread = np.linalg.inv(slopes[rows].T @ weighted)
+    return spread @ weighted.T @ values[rows], spread
+
+
+CONTRADICTION = 4.0
+"""This many standard deviations from the rig file are significant."""
+LEAST_CHANCE = 1e-3
+"""Cables differ if chance explains the differences with a lower probability."""
+
+
+@dataclass(frozen=True, slots=True)
+class Compliance:
+    """Estimate of the cables' compliance, 1 / stiffness; of the mean if they differ.
+
+    Attributes:
+        nominal: Of the rig file, to first order about the fit, [1/N].
+        estimated: From the data, [1/N].
+        deviation: Standard deviation of the difference, [1/N].
+    """
+
+    nominal: float
+    estimated: float
+    deviation: float
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether the data contradict the rig file."""
+        return abs(self.estimated - self.nominal) > CONTRADICTION * self.deviation
+
+    def __str__(self) -> str:
+        """The estimated stiffness as text."""
+        if self.estimated > 0.0:
+            return f"about {1.0 / self.estimated:.2g} N"
+        return "too high to determine"
+
+
+@dataclass(frozen=True, slots=True)
+class CableCompliances:
+    """Estimate of each cable's own compliance.
+
+    Attributes:
+        estimated: Shape (m,), [1/N].
+        chance: Probability of such differences by chance (p-value).
+    """
+
+    estimated: Array
+    chance: float
+
+    @property
+    def contradict(self) -> bool:
+        """Whether one compliance for all cables does not explain the data."""
+        return self.chance < LEAST_CHANCE
+
+    def __str__(self) -> str:
+        """The estimated stiffnesses as text."""
+        estimated = (
+            f"{1.0 / c:.2g} N" if c > 0.0 else "too high to determine" for c in self.estimated
+        )
+        return ", ".join(estimated)

@@ -15,68 +15,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
-from calibration.geometry.calibrate import RigCalibration, workspace_poses
+from calibration.geometry.calibrate import MOST_SCATTER, RigCalibration, workspace_poses
 from calibration.geometry.identifiability import ALL_OR_NONE, LEAST_SHARE
 from calibration.geometry.model import RigModel
-from calibration.results import CalibrationVerdict, Issue
+from calibration.geometry.parameters import (
+    CableCompliances,
+    Compliance,
+    common_changes,
+    deviation_text,
+    option_of,
+)
+from calibration.results import CalibrationVerdict, Issue, beyond
 from calibration.statistics import CONFIDENCE
 from model.pose import Array
-
-CONTRADICTION = 4.0
-"""This many standard deviations from the rig file are significant."""
-LEAST_CHANCE = 1e-3
-"""Cables differ if chance explains the differences with a lower probability."""
-
-
-@dataclass(frozen=True, slots=True)
-class Compliance:
-    """Estimate of the cables' compliance, 1 / stiffness; of the mean if they differ.
-
-    Attributes:
-        nominal: Of the rig file, to first order about the fit, [1/N].
-        estimated: From the data, [1/N].
-        deviation: Standard deviation of the difference, [1/N].
-    """
-
-    nominal: float
-    estimated: float
-    deviation: float
-
-    @property
-    def contradicts(self) -> bool:
-        """Whether the data contradict the rig file."""
-        return abs(self.estimated - self.nominal) > CONTRADICTION * self.deviation
-
-    def __str__(self) -> str:
-        """The estimated stiffness as text."""
-        if self.estimated > 0.0:
-            return f"about {1.0 / self.estimated:.2g} N"
-        return "too high to determine"
-
-
-@dataclass(frozen=True, slots=True)
-class CableCompliances:
-    """Estimate of each cable's own compliance.
-
-    Attributes:
-        estimated: Shape (m,), [1/N].
-        chance: Probability of such differences by chance (p-value).
-    """
-
-    estimated: Array
-    chance: float
-
-    @property
-    def contradict(self) -> bool:
-        """Whether one compliance for all cables does not explain the data."""
-        return self.chance < LEAST_CHANCE
-
-    def __str__(self) -> str:
-        """The estimated stiffnesses as text."""
-        estimated = (
-            f"{1.0 / c:.2g} N" if c > 0.0 else "too high to determine" for c in self.estimated
-        )
-        return ", ".join(estimated)
 
 
 def estimate_compliance(result: RigCalibration) -> Compliance | None:
@@ -187,6 +138,21 @@ FAR = 5.0
 """Largest credible deviation from the rig file, in stated standard deviations."""
 SCATTERED = 2.0
 """Largest acceptable scatter of a sensor or of measured poses, in stated standard deviations."""
+_SCALE = (
+    "the scale of the measured positions: the tracker's units and reflector (--reflector-mm, in"
+    " Python reflector=), the camera matrix, size_mm of the tags"
+)
+"""What to check where the whole rig seems to be of another size."""
+_FRAME = (
+    "whether the measured poses are in the world frame of the rig file: the camera's pose, or the"
+    " tracker's frame and reflector (--reflector-mm, in Python reflector=)"
+)
+"""What to check where outlets seem to have moved together."""
+CHECK_POSES = (
+    "the measured poses (positions of the platform's origin, or of the point that --reflector-mm,"
+    " in Python reflector=, states; qw first, by world_from_platform; in the rows of their counts)"
+)
+"""What to check where measured poses contradict the cables grossly."""
 _COMMON = (
     "calibrate the camera's lens, its pose and the tags more accurately, and pass their error as"
     " --pose-mm and --pose-deg, in Python pose_deviations=: all measured poses share it, so more of"
@@ -262,13 +228,13 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     out = result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    issues = _deviation_issues(result) + _stiffness_issues(result) + _tension_issues(result)
-    issues += _sensor_issues(result) + _pose_issues(result)
+    issues = _deviation_issues(result) + _common_issues(result) + _stiffness_issues(result)
+    issues += _tension_issues(result) + _sensor_issues(result) + _pose_issues(result)
     if missed > wanted:
         what = "samples" if out.poses else "cable lengths of samples"
         issues.append(
             Issue(
-                f"errors of held-out {what} reach {missed * 1e3:.2g} mm",
+                f"errors of held-out {what} reach {beyond(missed, wanted)}",
                 "calibrate the camera and its pose, and check for worn guides, slack cables, errors"
                 " of measured tensions and outliers in the report's list of poses",
             )
@@ -285,7 +251,7 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     if level > wanted:
         issues.append(
             Issue(
-                f"the platform may be {level * 1e3:.2g} mm off between the measured poses",
+                f"between the measured poses, the platform may be off by {beyond(level, wanted)}",
                 _shared_cause(level, *level_parts)
                 or "measure at more poses all over the workspace"
                 + ("" if out.poses else ", and with a camera"),
@@ -294,7 +260,8 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     if rotated > max(wanted, level):
         issues.append(
             Issue(
-                f"rotated by {math.degrees(tilt):.3g}° it may be {rotated * 1e3:.2g} mm off",
+                f"rotated by {math.degrees(tilt):.3g}°, the platform may be off by"
+                f" {beyond(rotated, wanted)}",
                 _shared_cause(rotated, *rotated_parts)
                 or f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
                 " (`cdpr calibrate poses` plans it); if it never rotates, pass --tilt-deg 0, in"
@@ -322,10 +289,10 @@ def _deviation_issues(result: RigCalibration) -> list[Issue]:
     if times[k] <= FAR:
         return []
     group = next(g for g, s in parameters.slices().items() if s.start <= k < s.stop)
-    option = f"--{group.replace('_', '-').removeprefix('cable-')}-{_UNITS.get(group, 'mm')}"
+    option = option_of(group)
     return [
         Issue(
-            f"{parameters.names[k]} is {_far(group, float(values[k]))},"
+            f"{parameters.names[k]} is {deviation_text(group, float(values[k]))},"
             f" {times[k]:.3g} times {option}",
             "check units, the order of the cables and the rig file; if it is truly that far"
             f" off, pass a larger {option}",
@@ -333,22 +300,30 @@ def _deviation_issues(result: RigCalibration) -> list[Issue]:
     ]
 
 
-_UNITS = {
-    **dict.fromkeys(("drum_scale", "stiffness", "cable_stiffness"), "percent"),
-    **dict.fromkeys(("swivel_zeros", "imu_mounting"), "deg"),
-}
-"""Unit in the option of a group; mm for the others."""
-
-
-def _far(group: str, value: float) -> str:
-    """Deviation from the rig file as text; of a stiffness it is the logarithm."""
-    if _UNITS.get(group) == "deg":
-        return f"{math.degrees(abs(value)):.3g}°"
-    if group in ("stiffness", "cable_stiffness"):
-        return f"{math.exp(value):.3g} times that of the rig file, as a logarithm"
-    if group == "drum_scale":
-        return f"{abs(value) * 1e2:.3g} % from the rig file"
-    return f"{abs(value) * 1e3:.3g} mm from the rig file"
+def _common_issues(result: RigCalibration) -> list[Issue]:
+    """Issues for changes that outlets and drums share, which residuals do not show."""
+    found = result.uncertainty
+    covariance = found.by_scatter + found.common @ found.common.T
+    changes, covariance = common_changes(result.parameters, result.fit.values, covariance)
+    scale, sizes = changes[6] * 1e2, [float(np.linalg.norm(changes[k : k + 3])) for k in (0, 3)]
+    compared = f"{abs(scale):.2g} % {'larger' if scale > 0.0 else 'smaller'}"
+    cases = (
+        (slice(6, 7), f"outlets and drums give a rig {compared} than its file", _SCALE),
+        (slice(3, 6), f"all outlets are rotated together by {math.degrees(sizes[1]):.2g}°", _FRAME),
+        (slice(0, 3), f"all outlets are displaced together by {sizes[0] * 1e3:.3g} mm", _FRAME),
+    )
+    issues = []
+    for part, what, check in cases:
+        own = changes[part]
+        times = math.sqrt(own @ np.linalg.solve(covariance[part, part], own))
+        if times > FAR:
+            reason = f"{what}, {times:.3g} standard deviations"
+            step = (
+                f"check {check}; if the rig file is truly that far off, pass a larger --outlets-mm,"
+                " in Python outlets in deviations="
+            )
+            issues.append(Issue(reason, step))
+    return issues
 
 
 def _stiffness_issues(result: RigCalibration) -> list[Issue]:
@@ -421,14 +396,16 @@ def _sensor_issues(result: RigCalibration) -> list[Issue]:
 
 def _pose_issues(result: RigCalibration) -> list[Issue]:
     """An issue for measured positions or rotations that scatter more than stated."""
+    by_camera = bool(result.rig.cameras)
+    causes = ["the camera's lens, the layout of the tags"] if by_camera else []
+    if not by_camera or result.pose_scales.max() > MOST_SCATTER:
+        causes.insert(0, CHECK_POSES)
+    step = (
+        f"check {', '.join(causes)} and the stated errors of the poses, or pass a larger --pose-mm"
+        " or --pose-deg, in Python pose_deviations="
+    )
     return [
-        Issue(
-            f"the measured {what} scatter {times:.3g} times as much as stated",
-            "check the camera's lens, the layout of the tags and the stated errors of the poses, or"
-            f" pass a larger --pose-{unit}, in Python pose_deviations=",
-        )
-        for what, times, unit in zip(
-            ("positions", "rotations"), result.pose_scales, ("mm", "deg"), strict=True
-        )
+        Issue(f"the measured {what} scatter {times:.3g} times as much as stated", step)
+        for what, times in zip(("positions", "rotations"), result.pose_scales, strict=True)
         if times > SCATTERED
     ]

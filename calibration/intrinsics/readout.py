@@ -45,6 +45,8 @@ LEAST = 5
 GOOD = 20
 _STEP = 2e-4
 """Step of the readout for finite differences, [s]."""
+_LEAST_RATIO = 1.5
+"""Of the times around an image for the second difference: at a lower one, noise would grow."""
 
 
 def open_timed_images(
@@ -212,18 +214,42 @@ def _moving(
             unused[name] = "no pose fits its tags"
         else:
             seen.append((name, views, bundle.camera_from_body))
+    moments = [times[name] for name, _, _ in seen]
+    poses = [camera.world_from_camera.compose(here) for _, _, here in seen]
     found = {}
-    for (before, _, first), (name, views, here), (after, _, last) in zip(
-        seen, seen[1:], seen[2:], strict=False
-    ):
-        between = times[after] - times[before]
+    for k, (name, views, here) in list(enumerate(seen))[1:-1]:
+        between = moments[k + 1] - moments[k - 1]
         if not 0.0 < between <= 2.0 * MEMORY:
             unused[name] = f"its neighbours are {between:.2g} s apart"
             continue
-        world = camera.world_from_camera
-        motion = PlatformMotion.between(world.compose(first), world.compose(last), between)
-        found[name] = _Moving(views, world.compose(here), here, motion)
+        found[name] = _Moving(views, poses[k], here, _motion_at(k, poses, moments))
     return found, unused
+
+
+def _motion_at(k: int, poses: Sequence[Pose], moments: Sequence[float]) -> PlatformMotion:
+    """Motion in an image, from the two before and the two after it where they are near.
+
+    Neighbours alone state the mean speed between them, which is too low while the platform
+    oscillates; their next ones show by how much (Richardson extrapolation).
+
+    Args:
+        k: Index of the image, neither the first nor the last.
+        poses: Of all images, ``world_from_platform``.
+        moments: Their times, [s].
+    """
+    between = moments[k + 1] - moments[k - 1]
+    near = PlatformMotion.between(poses[k - 1], poses[k + 1], between)
+    if not 2 <= k < len(poses) - 2:
+        return near
+    around = moments[k + 2] - moments[k - 2]
+    ratio = around / between
+    if not (ratio >= _LEAST_RATIO and around <= 2.0 * MEMORY):
+        return near
+    far, share = PlatformMotion.between(poses[k - 2], poses[k + 2], around), 1.0 / (ratio**2 - 1.0)
+    return PlatformMotion(
+        near.velocity + share * (near.velocity - far.velocity),
+        near.turning + share * (near.turning - far.turning),
+    )
 
 
 def _half_width(bends: Array, slopes: Array, cost: float, freedom: int) -> float:

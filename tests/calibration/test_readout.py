@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import yaml
 
-from calibration.intrinsics.readout import open_timed_images, readout_page
+from calibration.intrinsics.readout import _motion_at, open_timed_images, readout_page
 from calibration.procedures import measure_readout
 from calibration.result_files import load_result
 from model.errors import BadInput
-from model.pose import PlatformMotion, Pose
+from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
 from model.progress import Listener
 from model.rig import Rig, load_rig
 from model.scene import empty_scene
@@ -70,6 +70,27 @@ def test_the_readout_is_found_within_its_interval_and_is_tight(rig: Rig, film: P
     assert made.quality.good
     camera = rig.with_calibration(made).document.cameras[0]
     assert camera.readout_ms == pytest.approx(found.readout * 1e3)
+
+
+def test_the_speed_of_a_quick_oscillation_is_not_the_mean_between_images(rig: Rig) -> None:
+    """Twice a second at 30 Hz, the mean would be 3 % too low; at the ends it has to do."""
+    rate, size = 2.0 * np.pi * 2.0, np.array([0.0, 0.01, -0.004])
+    moments = [k / 30.0 for k in range(16)]
+    poses = [
+        Pose(
+            rig.home.position + size * np.sin(rate * t),
+            matrix_from_rotation_vector(2.0 * size * np.sin(rate * t)),
+        )
+        for t in moments
+    ]
+    fastest = rate * float(np.linalg.norm(size))
+    for k in range(1, 15):
+        true = rate * np.cos(rate * moments[k]) * size
+        off = np.linalg.norm(_motion_at(k, poses, moments).velocity - true)
+        assert off < (0.005 if 2 <= k < 14 else 0.035) * fastest
+        if 2 <= k < 14:
+            turning = _motion_at(k, poses, moments).turning
+            assert np.linalg.norm(turning - 2.0 * true) < 0.01 * fastest
 
 
 def test_a_camera_that_exposes_all_rows_at_once_has_none(rig: Rig, tmp_path: Path) -> None:

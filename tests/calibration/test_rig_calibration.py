@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from calibration.geometry.calibrate import (
     RigCalibration,
     _require_within,
+    _sent_to,
     fit_rig,
     workspace_poses,
 )
@@ -40,7 +41,7 @@ from calibration.geometry.model import (
     nominal_tensions,
     tension_sigma,
 )
-from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
+from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters, rig_with
 from calibration.geometry.quality import (
     estimate_cable_compliances,
     estimate_compliance,
@@ -51,8 +52,8 @@ from calibration.geometry.result import RigResult, require_same_nominal, rig_res
 from calibration.result_files import load_result
 from model.errors import BadInput, InvalidFile
 from model.files.rig_file import RigDocument
-from model.kinematics import poses_near
-from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
+from model.kinematics import cable_lengths, poses_near
+from model.pose import Array, Pose, matrix_from_rotation_vector, moved, rotation_vector_from_matrix
 from model.rig import Rig, load_rig, rig_from_document
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
@@ -513,6 +514,24 @@ def test_two_results_are_compared_by_where_the_platform_goes(
     assert np.linalg.norm(found.reached(*workspace_poses(rig, 0.0)) - sent, axis=1).max() > 1e-3
     with pytest.raises(BadInput, match="depend on different rig files"):
         one.apart_mm(one.model_copy(update={"rests_on": "another"}))
+
+
+def test_reached_positions_are_those_of_the_least_squares(rig: Rig, found: RigCalibration) -> None:
+    """By the rig file, the lengths contradict each other by millimetres."""
+    positions, rotations = workspace_poses(rig, 0.0)
+    counts = _sent_to(rig, positions, rotations)
+    lengths = RigModel(found.parameters, counts).counted.lengths(found.geometry)
+    rebuilt = rig_with(rig, found.geometry)
+    for k, reached in enumerate(found.reached(positions, rotations)):
+        start, wanted = Pose(positions[k], rotations[k]), lengths[k]
+        best = least_squares(
+            lambda x, start=start, wanted=wanted: cable_lengths(rebuilt, moved(start, x)) - wanted,
+            np.zeros(6),
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+        )
+        np.testing.assert_allclose(reached, moved(start, best.x).position, atol=1e-6)
 
 
 def test_counts_of_home_lead_the_corrected_rig_to_the_lengths_that_were_fitted(

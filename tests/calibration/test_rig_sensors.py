@@ -326,6 +326,25 @@ def test_a_measurement_in_another_unit_is_refused_with_the_columns(
     )
 
 
+@pytest.mark.parametrize(
+    "names",
+    ["roll_deg,pitch_deg,yaw_deg", "rx_deg,ry_deg,rz_deg", "Rot X [rad]", "std_rx_deg"],
+)
+def test_rotations_in_other_columns_are_refused_with_those_to_give(
+    tmp_path: Path, names: str
+) -> None:
+    """Half of the measurement would be lost without a word."""
+    path = tmp_path / "samples.csv"
+    head = f"actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,{names}"
+    path.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
+    with pytest.raises(BadInput, match=r"is of a rotation, but .*qw, qx, qy, qz") as caught:
+        read_rig_data(path, 2)
+    assert caught.value.next_step.startswith("give rotations as unit quaternions qw, qx, qy, qz")
+    path.write_text("actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,rate_z,ry\n1,1,1,1,1,1,1\n")
+    with pytest.raises(BadInput, match="'ry'"):
+        read_rig_data(path, 2)
+
+
 def test_the_program_finds_and_applies_them(
     rig: Rig, built: BuiltRig, data: RigMeasurements, tmp_path: Path
 ) -> None:
