@@ -163,9 +163,9 @@ def is_braked_at(rig: Rig, reference: HomingReference) -> bool:
 def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> str:
     """Why absolute encoders of braked drums seem to have lost turns; empty if they do not.
 
-    Either all count from 0, or all are whole turns, 0 included, from their last positions. Another
-    distance of any one means that drums were moved, which they counted. Without a brake a drum may
-    be at any angle.
+    Either all count near 0, and did not before; or all are whole turns, 0 included, from their last
+    positions. Another distance of any one means that drums were moved, which they counted. Without
+    a brake a drum may be at any angle.
 
     Args:
         rig: The robot.
@@ -179,10 +179,11 @@ def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int
     per_metre = np.array([abs(rig.winches[drive].counts_per_metre) for drive in braked])
     tolerance = np.minimum(rig.motion.start_tolerance * per_metre, HELD_TURN * per_turn)
     now, left = np.array(positions)[braked], np.array(reference.stands_at)[braked]
-    if (abs(now) <= tolerance).all() and (abs(left) > tolerance).any():
+    moved = now - left
+    if (abs(now) <= tolerance).all() and (np.minimum(abs(left), abs(moved)) > tolerance).any():
         return SWITCHED_ON
-    turns = np.rint((now - left) / per_turn)
-    if (abs(now - left - turns * per_turn) > tolerance).any():
+    turns = np.rint(moved / per_turn)
+    if (abs(moved - turns * per_turn) > tolerance).any():
         return ""
     named: dict[int, list[str]] = {}
     names = list(rig.drive_names.values())

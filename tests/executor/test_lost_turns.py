@@ -176,10 +176,11 @@ def test_all_encoders_at_0_are_within_a_brake_and_were_not_there() -> None:
     at_0 = homed(rig).model_copy(update={"stands_at": [0] * 8})
     one_off = at_0.model_copy(update={"stands_at": [0] * 7 + [most + 1]})
     near = at_0.model_copy(update={"stands_at": [0] * 7 + [most]})
-    for now in ([most] * 8, [-most] * 8):
+    for now in ([0] * 8, [most] * 7 + [0], [-most] * 8):
         assert why_turns_lost(rig, one_off, now) == references.SWITCHED_ON
         assert why_turns_lost(rig, near, now) == why_turns_lost(rig, at_0, now) == ""
-    for now in ([most + 1] + [0] * 7, [0] * 7 + [-most - 1]):
+    settled = [0] * 7 + [1]
+    for now in (settled, [most + 1] + [0] * 7, [0] * 7 + [-most - 1]):
         assert why_turns_lost(rig, one_off, now) == ""
 
 
