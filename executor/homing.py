@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from executor.control.winch_loop import MakeLaw
 from executor.control.winch_motion import WinchResult
 from executor.drives import is_simulated, read_snapshot, require_drives
 from executor.interlock.interlock import MotionInterlock
-from executor.interlock.reference import HomingReference, reference_at
+from executor.interlock.reference import HomingReference, counting_hash
 from executor.proposals import Facts, Proposal, forget_proposal, homing_proposal, require_confirmed
 from executor.realtime.scheduling import require_imported_script
 from executor.remote.command_server import commands_from_start
@@ -41,6 +42,7 @@ from model.errors import (
     require_types,
     truth_value,
 )
+from model.files.documents import PoseDocument
 from model.kinematics import cable_lengths
 from model.pages.page import FactsDisplay
 from model.pose import Array, Pose
@@ -48,7 +50,7 @@ from model.progress import SILENT, Listener
 from model.rig import Camera, Rig
 from model.scene import empty_scene, require_unaltered
 from model.statics.gravity import working_tensions
-from model.winches import whole_lengths
+from model.winches import WinchMap, whole_lengths
 from planner.settings import whole_number
 from tracking.clearance import require_stated_errors
 
@@ -205,11 +207,41 @@ def home(
     return HomeResult(reference, None if in_process else interlock.file.path)
 
 
+def reference_at(
+    rig: Rig, pose: Pose, counts: Array, tensions: Array, how: str, uncertainty: float
+) -> HomingReference:
+    """The reference from taut cables at a known pose.
+
+    Args:
+        rig: The robot as its file describes it.
+        pose: ``world_from_platform``.
+        counts: Positions of the drives there, shape (m,), [counts].
+        tensions: Of the cables there, shape (m,), [N].
+        how: How the pose is known.
+        uncertainty: Of the pose, standard deviation of the position or of a cable's length, [m].
+    """
+    winches = WinchMap(rig)
+    unstrained = winches.unstrained(cable_lengths(rig, pose), tensions)
+    home = winches.home_counts + counts - winches.counts(unstrained)
+    return HomingReference(
+        schema_version=1,
+        rig=rig.name,
+        rig_hash=counting_hash(rig),
+        made=datetime.now(UTC).isoformat(timespec="seconds"),
+        how=how,
+        pose=PoseDocument.of(pose),
+        uncertainty_mm=round(uncertainty * 1000.0, 4),
+        home_counts=[int(c) for c in np.rint(home)],
+        tensions_n=[round(float(t), 3) for t in tensions],
+        stands_at=[int(c) for c in np.rint(counts)],
+    )
+
+
 def use_rig_file_counts(rig: Rig, *, confirm: Callable[[Proposal], bool] | None = None) -> None:
     """Discards the reference: absolute encoders count as in the rig file. Moves nothing.
 
     Raises:
-        Refused: The bus is latched, not all encoders are absolute, or one lost whole turns.
+        Refused: The bus is latched, not all encoders are absolute, or encoders lost turns.
         StoppedByOperator: Cancelled.
         CdprError: Drives with brakes, whose last positions are known, cannot be read.
     """

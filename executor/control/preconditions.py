@@ -116,9 +116,9 @@ def require_still_referenced(
     """Requires the drives to have kept their reference.
 
     A drive without an absolute encoder silently loses its configuration and position with its
-    power. So it must still have its configuration, and be at its last known position. An absolute
-    one must not count whole turns from where its brake held it. Any drive that was left holding its
-    cable must still hold it.
+    power. So it must still have its configuration, and be at its last known position. Absolute
+    ones with brakes must not have lost turns. Any drive that was left holding its cable must still
+    hold it.
 
     Args:
         rig: The robot.

@@ -89,7 +89,7 @@ class MotionInterlock:
         return self.why_turns_lost(positions) or moved
 
     def why_turns_lost(self, positions: Sequence[int]) -> str:
-        """Why the reference is lost, where encoders now at positions [counts] lost whole turns."""
+        """Why the reference is lost, where encoders now at positions [counts] lost turns."""
         reference = self._braked_at()
         return "" if reference is None else why_turns_lost(self._rig, reference, positions)
 
@@ -402,11 +402,14 @@ class MotionInterlock:
                 have held them at known ones.
 
         Raises:
-            Refused: As `use_rig_file_counts`; or an encoder lost whole turns.
+            Refused: As `use_rig_file_counts`; or encoders lost turns, now or since homing.
             CdprError: The drives cannot be read.
         """
         self.require_free()
         self._require_absolute()
+        kept = self._readable()
+        if kept is not None and kept.has_lost_turns:
+            raise lost_reference(self._rig, kept, self.file.where)
         if self._braked_at() is not None and (lost := self.why_turns_lost(read_positions())):
             raise turns_lost(lost, self.file.where)
 

@@ -13,7 +13,6 @@ import json
 import os
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,24 +24,27 @@ from drivers.plausibility import HOME
 from executor.interlock.locks import WRITABLE, read_state_file, state_files
 from model.errors import CdprError, Refused
 from model.files.documents import Document, PoseDocument, content_hash, document_hash, write_atomic
-from model.kinematics import cable_lengths
-from model.pose import Array, Pose
 from model.rig import Rig, rig_from_document
-from model.winches import WinchMap
 
 AGAIN = f"home the drives: {HOME}; nothing was moved"
 
 #: Besides, for absolute encoders.
 AS_IN_THE_FILE = "if they count as in the rig file, `cdpr home RIG --as-rig-file` instead"
 
-#: Next step where encoders lost whole turns.
+#: Next step where encoders lost turns.
 OVER_THE_TRAVEL = f"make the encoders absolute over the whole travel, then {AGAIN}"
 
 #: Why a drive lost its configuration, and with it the reference of an incremental encoder.
 RESTARTED = "power-cycled, or `bus.cycle_ms` was changed"
 
-#: Why encoders that keep their position without power lost their reference.
-BRAKED = ("than where its brake held it", "than where their brakes held them")
+#: How a loss by whole turns ends.
+TURNS_AWAY = "than at the last known position"
+
+#: Loss by encoders that begin at 0 with their power.
+SWITCHED_ON = (
+    "all absolute encoders with a brake count from 0, as if from where they were switched on"
+    " (ODrive: absolute_setpoints)"
+)
 
 #: A brake holds a drum within this part of a motor turn, if not within the start tolerance.
 HELD_TURN = 0.1
@@ -76,35 +78,10 @@ class HomingReference(Document):
         """Whether drives were at `stands_at`: absolute encoders never homed have not moved yet."""
         return bool(self.made) or self.stands_at != self.home_counts
 
-
-def reference_at(
-    rig: Rig, pose: Pose, counts: Array, tensions: Array, how: str, uncertainty: float
-) -> HomingReference:
-    """The reference from taut cables at a known pose.
-
-    Args:
-        rig: The robot as its file describes it.
-        pose: ``world_from_platform``.
-        counts: Positions of the drives there, shape (m,), [counts].
-        tensions: Of the cables there, shape (m,), [N].
-        how: How the pose is known.
-        uncertainty: Of the pose, standard deviation of the position or of a cable's length, [m].
-    """
-    winches = WinchMap(rig)
-    unstrained = winches.unstrained(cable_lengths(rig, pose), tensions)
-    home = winches.home_counts + counts - winches.counts(unstrained)
-    return HomingReference(
-        schema_version=1,
-        rig=rig.name,
-        rig_hash=counting_hash(rig),
-        made=datetime.now(UTC).isoformat(timespec="seconds"),
-        how=how,
-        pose=PoseDocument.of(pose),
-        uncertainty_mm=round(uncertainty * 1000.0, 4),
-        home_counts=[int(c) for c in np.rint(home)],
-        tensions_n=[round(float(t), 3) for t in tensions],
-        stands_at=[int(c) for c in np.rint(counts)],
-    )
+    @property
+    def has_lost_turns(self) -> bool:
+        """Whether it is lost as in `why_turns_lost`: no motion since makes these counts right."""
+        return self.lost.endswith((TURNS_AWAY, SWITCHED_ON))
 
 
 def as_in_the_file(rig: Rig) -> HomingReference:
@@ -176,19 +153,19 @@ def why_moved(rig: Rig, reference: HomingReference, positions: Sequence[int]) ->
 def is_braked_at(rig: Rig, reference: HomingReference) -> bool:
     """Whether brakes should hold absolute encoders of this rig at the last positions on file.
 
-    Not where cables were released: they may have rotated the drums.
+    Not once it is lost: released cables, or a motion since, may have rotated the drums.
     """
     is_of_rig = reference.is_measured and reference.rig_hash == counting_hash(rig)
-    held = not reference.lost or reference.lost.endswith(BRAKED)
-    return is_of_rig and held and any(winch.absolute and winch.brake for winch in rig.winches)
+    braked = any(winch.absolute and winch.brake for winch in rig.winches)
+    return is_of_rig and braked and not reference.lost
 
 
 def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int]) -> str:
-    """Which absolute encoders count whole turns from where brakes held them; empty if none does.
+    """Why absolute encoders of braked drums seem to have lost turns; empty if they do not.
 
-    The brake held the drum, so they lost these turns with their power. Any other distance means
-    that the drum moved, which they counted. Without a brake it may have moved by whole turns as
-    well as by any other angle.
+    Either all count near 0, and did not before; or all are whole turns, 0 included, from their last
+    positions. Another distance of any one means that drums were moved, which they counted. Without
+    a brake a drum may be at any angle.
 
     Args:
         rig: The robot.
@@ -197,20 +174,26 @@ def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int
     """
     if not reference.is_measured or len(positions) != len(reference.stands_at):
         return ""
+    braked = [drive for drive, winch in enumerate(rig.winches) if winch.absolute and winch.brake]
+    per_turn = np.array([rig.winches[drive].counts_per_turn for drive in braked])
+    per_metre = np.array([abs(rig.winches[drive].counts_per_metre) for drive in braked])
+    tolerance = np.minimum(rig.motion.start_tolerance * per_metre, HELD_TURN * per_turn)
+    now, left = np.array(positions)[braked], np.array(reference.stands_at)[braked]
+    moved = now - left
+    if (abs(now) <= tolerance).all() and (np.minimum(abs(left), abs(moved)) > tolerance).any():
+        return SWITCHED_ON
+    turns = np.rint(moved / per_turn)
+    if (abs(moved - turns * per_turn) > tolerance).any():
+        return ""
     named: dict[int, list[str]] = {}
-    names, left = rig.drive_names.values(), reference.stands_at
-    for name, winch, now, then in zip(names, rig.winches, positions, left, strict=True):
-        turns = round((now - then) / winch.counts_per_turn)
-        off = abs(now - then - turns * winch.counts_per_turn)
-        tolerance = rig.motion.start_tolerance * abs(winch.counts_per_metre)
-        held = off <= min(tolerance, HELD_TURN * winch.counts_per_turn)
-        if winch.absolute and winch.brake and turns and held:
-            named.setdefault(turns, []).append(name)
+    names = list(rig.drive_names.values())
+    for drive, count in zip(braked, turns.astype(int).tolist(), strict=True):
+        named.setdefault(count, []).append(names[drive])
     return "; ".join(
-        f"{', '.join(names)} {'count' if names[1:] else 'counts'} {abs(turns)} whole"
-        f" turn{'s' if abs(turns) > 1 else ''} {'more' if turns > 0 else 'less'}"
-        f" {BRAKED[bool(names[1:])]}"
-        for turns, names in named.items()
+        f"{', '.join(names)} {'count' if names[1:] else 'counts'} {abs(count)} whole"
+        f" turn{'s' if abs(count) > 1 else ''} {'more' if count > 0 else 'less'} {TURNS_AWAY}"
+        for count, names in named.items()
+        if count
     )
 
 
@@ -359,7 +342,7 @@ def lost_reference(rig: Rig, reference: HomingReference, where: str) -> Refused:
         "the homing reference is lost",
         where=where,
         why=f"{reference.lost}; {homed}",
-        next_step=OVER_THE_TRAVEL if reference.lost.endswith(BRAKED) else next_step,
+        next_step=OVER_THE_TRAVEL if reference.has_lost_turns else next_step,
     )
 
 
@@ -374,12 +357,12 @@ def changed_reference(now: HomingReference, where: str) -> Refused:
 
 
 def turns_lost(lost: str, where: str) -> Refused:
-    """Refusal of absolute encoders that lost whole turns; ``lost`` from `why_turns_lost`."""
+    """Refusal of absolute encoders that lost turns; ``lost`` from `why_turns_lost`."""
     return Refused(
         f"the homing reference is lost: {lost}",
         where=where,
-        why="an encoder lost these turns with its power: it is not absolute over the whole travel,"
-        " or not set up so (ODrive: absolute_setpoints)",
+        why="encoders that are not absolute over the whole travel, or not set up so (ODrive:"
+        " absolute_setpoints), lose turns with their power; or other means moved every drum so",
         next_step=OVER_THE_TRAVEL,
     )
 

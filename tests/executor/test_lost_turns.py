@@ -15,11 +15,11 @@ from drivers.drive_group import DriveSnapshot
 from executor import homing
 from executor.control.preconditions import require_still_referenced
 from executor.control.standstill import reset_drives
-from executor.homing import use_rig_file_counts
+from executor.homing import reference_at, use_rig_file_counts
 from executor.interlock import reference as references
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock, reference_status
-from executor.interlock.reference import HomingReference, reference_at, why_turns_lost
+from executor.interlock.reference import HomingReference, why_turns_lost
 from executor.realtime.child import Armed, Ended
 from executor.state_machine import State
 from model.errors import HardwareMissing, Refused
@@ -27,7 +27,7 @@ from model.rig import Rig, load_rig, rig_from_document
 from tests.cli.plans import RIG
 
 ALL = tuple(range(1, 9))
-HELD = "than where its brake held it"
+LAST = "than at the last known position"
 
 
 @pytest.fixture(autouse=True)
@@ -68,17 +68,16 @@ def seen(positions: Sequence[int]) -> DriveSnapshot:
 @pytest.mark.parametrize(
     ("positions", "text"),
     [
-        (at(-1, [1]), f"cable 1 (drive 1) counts 1 whole turn less {HELD}"),
-        (at(3, [2]), f"cable 2 (drive 2) counts 3 whole turns more {HELD}"),
+        (at(-1, [1]), f"cable 1 (drive 1) counts 1 whole turn less {LAST}"),
+        (at(3, [2]), f"cable 2 (drive 2) counts 3 whole turns more {LAST}"),
         (
             at(-2, [1, 8]),
-            "cable 1 (drive 1), cable 8 (drive 8) count 2 whole turns less than where their brakes"
-            " held them",
+            f"cable 1 (drive 1), cable 8 (drive 8) count 2 whole turns less {LAST}",
         ),
         (
             [*at(1, [1])[:7], 1000 - 16384],
-            f"cable 1 (drive 1) counts 1 whole turn more {HELD};"
-            f" cable 8 (drive 8) counts 1 whole turn less {HELD}",
+            f"cable 1 (drive 1) counts 1 whole turn more {LAST};"
+            f" cable 8 (drive 8) counts 1 whole turn less {LAST}",
         ),
     ],
 )
@@ -106,9 +105,19 @@ def test_encoders_that_lost_whole_turns_lose_the_reference(positions: list[int],
         (rig_with(), at(0, more=700)),
         (rig_with(), at(0.5)),
         (rig_with(), at(-3.25, [4])),
+        (rig_with(), [*at(1)[:7], 1000 + 17500]),
+        (rig_with(), [1000 + 900, *at(2)[1:]]),
         (rig_with(brake=False), at(1)),
     ],
-    ids=["at rest", "settled in the brake", "turned by hand", "one turned", "no brake held them"],
+    ids=[
+        "at rest",
+        "settled in the brake",
+        "turned by hand",
+        "one turned",
+        "moved by another program, the last by 1.07 turns",
+        "moved, the first by 1.1 mm",
+        "no brake held them",
+    ],
 )
 def test_drums_that_were_turned_keep_the_reference(rig: Rig, positions: list[int]) -> None:
     reference = homed(rig)
@@ -118,6 +127,61 @@ def test_drums_that_were_turned_keep_the_reference(rig: Rig, positions: list[int
     require_still_referenced(rig, reference, (), seen(positions))
     interlock.found_at_rest(positions, (), ())
     assert interlock.why_unreferenced(positions) == ""
+
+
+def _rig_of(*winches: dict[str, object]) -> Rig:
+    """With these changes of its first winches."""
+    document = rig_with().document
+    changed = [w.model_copy(update=c) for w, c in zip(document.winches, winches, strict=False)]
+    changed += document.winches[len(changed) :]
+    return rig_from_document(document.model_copy(update={"winches": changed}))
+
+
+@pytest.mark.parametrize("other", [{"brake": False}, {"encoder": "incremental"}])
+def test_only_absolute_encoders_with_a_brake_are_compared(other: dict[str, object]) -> None:
+    """Any other drum may be at any angle, also while the others lose turns."""
+    rig = _rig_of(other)
+    reference = homed(rig)
+    for elsewhere in (at(0.3, [1]), at(1, [1])):
+        assert why_turns_lost(rig, reference, elsewhere) == ""
+        lost = why_turns_lost(rig, reference, [elsewhere[0], *at(1, [2])[1:]])
+        assert lost == f"cable 2 (drive 2) counts 1 whole turn more {LAST}"
+    assert why_turns_lost(rig, reference, [5000, *[0] * 7]) == references.SWITCHED_ON
+
+
+def test_encoders_that_count_from_where_they_were_switched_on_lose_the_reference() -> None:
+    """ODrives without `absolute_setpoints`: 71 % of the poses passed, 200 mm from the true one."""
+    rig = rig_with()
+    MotionInterlock(rig).file.write(homed(rig).model_copy(update={"stands_at": at(3.3, [2])}))
+    interlock = MotionInterlock(rig)
+    zero = [0, 5, -5, 100, 0, 0, 0, 0]
+    assert interlock.why_unreferenced(zero) == references.SWITCHED_ON
+    assert "absolute_setpoints" in references.SWITCHED_ON
+    assert interlock.still_counts(zero) is None
+    kept = interlock.kept_reference()
+    with pytest.raises(Refused, match="absolute_setpoints") as caught:
+        require_still_referenced(rig, kept, (), seen(zero))
+    assert "absolute over the whole travel" in caught.value.next_step
+    assert not reference_status(interlock, zero, held=True).valid_after_reset
+    reset(rig, zero)
+    assert references.SWITCHED_ON in MotionInterlock(rig).why_unreferenced()
+    with pytest.raises(Refused, match="reference is lost") as caught:
+        use_rig_file_counts(rig)
+    assert caught.value.next_step == references.OVER_THE_TRAVEL
+
+
+def test_all_encoders_at_0_are_within_a_brake_and_were_not_there() -> None:
+    rig = rig_with()
+    most = int(rig.motion.start_tolerance * abs(rig.winches[0].counts_per_metre))
+    at_0 = homed(rig).model_copy(update={"stands_at": [0] * 8})
+    one_off = at_0.model_copy(update={"stands_at": [0] * 7 + [most + 1]})
+    near = at_0.model_copy(update={"stands_at": [0] * 7 + [most]})
+    for now in ([0] * 8, [most] * 7 + [0], [-most] * 8):
+        assert why_turns_lost(rig, one_off, now) == references.SWITCHED_ON
+        assert why_turns_lost(rig, near, now) == why_turns_lost(rig, at_0, now) == ""
+    settled = [0] * 7 + [1]
+    for now in (settled, [most + 1] + [0] * 7, [0] * 7 + [-most - 1]):
+        assert why_turns_lost(rig, one_off, now) == ""
 
 
 def test_incremental_encoders_are_elsewhere_by_any_distance() -> None:
@@ -135,6 +199,7 @@ def test_a_brake_holds_within_the_start_tolerance() -> None:
         assert why_turns_lost(rig, reference, at(1, [1], off))
     for off in (most + 1, -most - 1):
         assert why_turns_lost(rig, reference, at(1, [1], off)) == ""
+        assert why_turns_lost(rig, reference, [1000 + off, *at(1, [8])[1:]]) == ""
 
 
 def test_with_a_high_gear_a_brake_holds_within_a_tenth_of_a_turn() -> None:
@@ -287,13 +352,37 @@ def test_counts_of_the_rig_file_need_encoders_that_lost_no_turns(
     refused("counts? 1 whole turn more")
     monkeypatch.setattr(homing, "read_snapshot", silent)
     refused("no answer")
-    MotionInterlock(rig).found_at_rest(at(1), (), ())
-    found(at(2))
-    refused("2 whole turns more")
     found(at(0))  # with `absolute_setpoints` they count as before
     use_rig_file_counts(rig)
     assert MotionInterlock(rig).kept_reference() is None
     monkeypatch.setattr(homing, "read_snapshot", silent)
+    use_rig_file_counts(rig)
+
+
+@pytest.mark.parametrize("made", [True, False], ids=["homed", "never homed"])
+@pytest.mark.parametrize("rehome", [True, False], ids=["homing", "jog of a cable"])
+def test_a_motion_after_lost_turns_does_not_make_them_count_as_in_the_rig_file(
+    rehome: bool, made: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Homing that was stopped moved the drums by part of a turn: `--as-rig-file` was accepted."""
+    rig = rig_with()
+    reference = homed(rig) if made else references.as_in_the_file(rig)
+    MotionInterlock(rig).file.write(reference.model_copy(update={"stands_at": at(0)}))
+    interlock = MotionInterlock(rig)
+    interlock.found_at_rest(at(-1), (), ())
+    interlock.begin(Path("run"), interlock.still_counts(at(-1)), rehome=rehome)
+    moved = at(-1, more=2500)
+    interlock.end(State.STOPPED, "stopped", Path("run"), holding=True, positions=moved)
+    for positions in (moved, at(-1), at(0)):
+        monkeypatch.setattr(homing, "read_snapshot", lambda *_, now=positions: seen(now))
+        with pytest.raises(Refused, match="count 1 whole turn less") as caught:
+            use_rig_file_counts(rig)
+        assert caught.value.next_step == references.OVER_THE_TRAVEL
+        assert MotionInterlock(rig).kept_reference() is not None
+    other = rig_with(counts_per_rev=4096)
+    with pytest.raises(Refused, match="count 1 whole turn less"):
+        use_rig_file_counts(other)
+    MotionInterlock(rig).file.write(homed(rig))
     use_rig_file_counts(rig)
 
 

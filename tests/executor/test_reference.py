@@ -23,10 +23,10 @@ from executor.control.preconditions import require_still_referenced
 from executor.control.standstill import release_drives
 from executor.control.winch_motion import move_winches
 from executor.drives import open_drives
-from executor.homing import use_rig_file_counts
+from executor.homing import reference_at, use_rig_file_counts
 from executor.interlock import locks as state_folder
 from executor.interlock.interlock import MotionInterlock, reference_status
-from executor.interlock.reference import HomingReference, as_in_the_file, reference_at
+from executor.interlock.reference import HomingReference, as_in_the_file
 from executor.proposals import Proposal
 from executor.realtime.child import Armed, Ended, Records
 from executor.realtime.process import RealTimeProcess

@@ -27,10 +27,10 @@ from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind
 from executor.control.winch_loop import LawMotion, WinchesHere
 from executor.control.winch_motion import WinchResult, move_winches, recording, require_held
 from executor.drives import current_pose
-from executor.homing import home
+from executor.homing import home, reference_at
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
-from executor.interlock.reference import HomingReference, reference_at, referenced
+from executor.interlock.reference import HomingReference, referenced
 from executor.jogging import plan_straight_move
 from executor.realtime.child import ReadyDrives
 from executor.realtime.scheduling import SimulatedClock

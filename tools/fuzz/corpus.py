@@ -169,8 +169,8 @@ def _state(folder: Path) -> None:
     """A homing reference and an engaged fault latch."""
     import numpy as np
 
+    from executor.homing import reference_at
     from executor.interlock.fault_latch import LatchedFault
-    from executor.interlock.reference import reference_at
     from model.pose import Pose
     from model.rig import load_rig
 
