@@ -91,9 +91,9 @@ class TagsResult(ResultDocument):
         """
         self.require_basis(_basis(rig), "sizes or numbers of tags")
         assert rig.tags is not None  # or their basis were another
-        placed = {tag.id: tag for tag in self.platform}
-        tags = [placed.get(tag.id, tag) for tag in rig.tags.platform]
-        is_whole = all(tag.id in placed for tag in rig.tags.platform)
+        measured = {tag.id: tag for tag in self.platform}
+        tags = [measured.get(tag.id, tag) for tag in rig.tags.platform]
+        is_whole = all(tag.id in measured for tag in rig.tags.platform)
         changes = {"platform": tags, "error_mm": self.error_mm if is_whole else None}
         return rig.model_copy(update={"tags": rig.tags.model_copy(update=changes)})
 
