@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from model.errors import BadInput, Fault
-from model.pose import Array, Pose, floats_of, matrix_from_rotation_vector, moved, read_only
+from model.pose import (
+    Array,
+    Pose,
+    floats_of,
+    matrix_from_rotation_vector,
+    moved,
+    read_only,
+    skew,
+)
 from model.statics.wrench_sets import rms_anchor_radius
 
 if TYPE_CHECKING:
@@ -325,7 +333,7 @@ def _squares_near(
     matrices, errors = structure_matrix_of(cables, positions), cables.lengths - lengths
     arms, shares = cables.anchors - positions[:, None, :], errors / cables.lengths
     by_twist = np.zeros((*arms.shape, 6))
-    by_twist[..., :3], by_twist[..., 3:] = np.eye(3), np.cross(arms[..., None, :], np.eye(3))
+    by_twist[..., :3], by_twist[..., 3:] = np.eye(3), -skew(arms)
     normal = (matrices * (1.0 - shares[:, None, :])) @ np.swapaxes(matrices, 1, 2)
     normal += np.einsum("nm,nmki,nmkj->nij", shares, by_twist, by_twist)
     mixed = np.einsum("nm,nmi,nmj->nij", errors, cables.directions, arms)

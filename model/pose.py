@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from model.errors import BadInput, distinct_figures, require_types
 
 Array = NDArray[np.float64]
+_CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).swapaxes(1, 2).reshape(3, 9)
 
 
 def floats_of(values: ArrayLike) -> Array:
@@ -104,9 +105,9 @@ def _remade(kind: type[ReadOnly], values: dict[str, object]) -> ReadOnly:
 
 
 def skew(vector: ArrayLike) -> Array:
-    """Matrix of the cross product: ``skew(a) @ b == a × b``; shape (3, 3)."""
-    x, y, z = np.asarray(vector, dtype=np.float64).tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Matrix of the cross product: ``skew(a) @ b == a × b``; shape (..., 3, 3) of (..., 3)."""
+    vectors = np.asarray(vector, dtype=np.float64)
+    return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
@@ -295,8 +296,7 @@ class Pose(ReadOnly):
 
     def apply(self, points: ArrayLike) -> Array:
         """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
-        mapped: Array = floats_of(points) @ self.rotation.T + self.position
-        return mapped
+        return np.asarray(floats_of(points) @ self.rotation.T + self.position)
 
     def compose(self, other: Pose) -> Pose:
         """``a_from_b.compose(b_from_c)`` is ``a_from_c``."""

@@ -147,10 +147,7 @@ class RigMeasurements:
         point = self.has_position & ~self.has_rotation
         information[point, :3, :3] = np.linalg.inv(self.covariances[point, :3, :3])
         by_twist = np.tile(np.eye(6), (len(self), 1, 1))
-        x, y, z = self._arms(rotations).T
-        by_twist[:, 0, 4], by_twist[:, 0, 5] = z, -y
-        by_twist[:, 1, 3], by_twist[:, 1, 5] = -z, x
-        by_twist[:, 2, 3], by_twist[:, 2, 4] = y, -x
+        by_twist[:, :3, 3:] = -skew(self._arms(rotations))
         return np.asarray(np.swapaxes(by_twist, 1, 2) @ information @ by_twist)
 
     def first_rotations(self, rig: Rig) -> Array:

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from model.errors import BadInput, positive_number
-from model.pose import Array, read_only
+from model.pose import Array, read_only, skew
 from model.rig import Rig
 
 AXES = ("x", "y", "z")
@@ -229,7 +229,7 @@ def common_changes(parameters: Parameters, values: Array, covariance: Array) -> 
     slopes = np.zeros((len(parameters), 7))
     of_outlets = np.zeros((*centred.shape, 7))
     of_outlets[..., :3] = np.eye(3)
-    of_outlets[..., 3:6] = np.swapaxes(np.cross(np.eye(3), centred[:, None]), 1, 2)
+    of_outlets[..., 3:6] = -skew(centred)
     of_outlets[..., 6] = centred
     slopes[slices["outlets"]] = of_outlets.reshape(-1, 7)
     if "drum_scale" in slices:
