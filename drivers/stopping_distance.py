@@ -136,16 +136,40 @@ def stopping_remarks(
         return []
     positions = np.array([pose.position for pose in waypoints])
     rotations = np.array([pose.rotation for pose in waypoints])
-    turns = bool(np.abs(rotations - rotations[0]).max() > 1e-6)
-    coasting = coasting_distance(rig, loads, positions, rotations, margin, turns=turns)
     try:
-        require_stopping_room(rig, clearance, coasting, turns=turns)
+        require_stopping_room_along(rig, loads, positions, rotations, clearance, margin)
     except Refused as refused:
         return [f"a run at {rig.motion.speed * 1000:.3g} mm/s may be refused: {refused.what}"]
     except BadInput as error:  # a profile file of another computer or folder
         why = str(error).partition("\n")[0]
         return [f"whether a run can stop before obstacles is not checked: {why}"]
     return []
+
+
+def require_stopping_room_along(
+    rig: Rig,
+    loads: Sequence[Load],
+    positions: Array,
+    rotations: Array,
+    clearance: float,
+    margin: float,
+) -> None:
+    """As `require_stopping_room`, for a path.
+
+    Args:
+        rig: The robot, whose motion has the path's speed.
+        loads: Payloads carried along the path.
+        positions: As for `coasting_distance`.
+        rotations: As for `coasting_distance`.
+        clearance: Proved for the whole path, [m]; infinite without obstacles.
+        margin: Smallest capacity margin of the path, [N].
+
+    Raises:
+        Refused: The clearance is smaller than the distance to a stop.
+    """
+    turns = bool(np.abs(rotations - rotations[0]).max() > 1e-6)  # beyond rounding errors of files
+    coasting = coasting_distance(rig, loads, positions, rotations, margin, turns=turns)
+    require_stopping_room(rig, clearance, coasting, turns=turns)
 
 
 def require_stopping_room(rig: Rig, clearance: float, coasting: float, *, turns: bool) -> None:

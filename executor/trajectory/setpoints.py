@@ -15,7 +15,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.stopping_distance import coasting_distance, require_stopping_room
+from drivers.stopping_distance import require_stopping_room_along
 from executor.trajectory.dwell import (
     Dwell,
     dwell_violations,
@@ -131,11 +131,6 @@ class Trajectory:
         rounded = np.rint(self.counts).astype(np.int32)
         rounded.setflags(write=False)
         return rounded
-
-    @property
-    def turns(self) -> bool:
-        """Whether the platform rotates, beyond rounding errors of files."""
-        return bool(np.abs(self.rotations - self.rotations[0]).max() > 1e-6)
 
     @property
     def hash(self) -> str:
@@ -271,10 +266,8 @@ def check_table(rig: Rig, scene: Scene, table: Trajectory) -> CheckedTrajectory:
             report.cure or "plan again, with a larger clearance if that is violated",
         )
     loads = [leg.scene.load for leg in legs_of(scene)]
-    margin, clearance = report.proved_capacity_margin, report.proved_obstacle_clearance
-    path, turns = (table.positions, table.rotations), table.turns
-    coasting = coasting_distance(rig, loads, *path, margin, turns=turns)
-    require_stopping_room(rig, clearance, coasting, turns=turns)
+    room = report.proved_obstacle_clearance, report.proved_capacity_margin
+    require_stopping_room_along(rig, loads, table.positions, table.rotations, *room)
     return CheckedTrajectory(table, rig, table.hash, report, WinchMap(rig), _PROOF)
 
 
