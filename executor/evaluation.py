@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -303,17 +303,17 @@ def rewrite_report(folder: RunFolder) -> None:
 def _files(folder: RunFolder, result: EvaluatedRun) -> list[_File]:
     """The files and their writers, most important first."""
     cycles, poses, clearance = result.cycles, result.poses, result.clearance
+    fused = cache(partial(fused_table, cycles, poses))  # of two files; slow for a run of hours
 
     def write_channels() -> None:
-        together = fused_table(cycles, poses)
-        write_mcap(folder, result.context, cycles, poses, clearance, together, result.alone)
+        write_mcap(folder, result.context, cycles, poses, clearance, fused(), result.alone)
 
     files: list[_File] = [
         (CYCLES, partial(folder.write_table, CYCLES, cycles)),
         *_pose_files(folder, poses, result.alone),
         (CLEARANCE, partial(folder.write_table, CLEARANCE, clearance)),
         (SUMMARY, partial(folder.write_summary, result.summary)),
-        (FUSED, lambda: folder.write_table(FUSED, fused_table(cycles, poses))),
+        (FUSED, lambda: folder.write_table(FUSED, fused())),
         (MCAP, write_channels),
     ]
     sums = partial(write_checksums, folder.path, [*BEGUN, *dict(files)])
