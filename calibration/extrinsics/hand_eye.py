@@ -351,11 +351,11 @@ def _consistency(
     by_distance, by_focal = (one.deviations(camera, by_lens) for one in (distances, focal))
     likelier = [(distances, by_distance, _distance_issue), (focal, by_focal, _focal_issue)]
     likelier.sort(key=lambda one: -abs(one[0].test[0]) / one[1][12])
-    issues: list[Issue] = []
-    for fit, deviations, issue in likelier:
-        value, limit = float(fit.test[0]), _SIGNIFICANT * float(deviations[12])
-        if abs(value) > max(limit, _LEAST_CHANGE) and not issues:
-            issues.append(issue(value))
+    issues = [
+        issue(float(fit.test[0]))
+        for fit, deviations, issue in likelier
+        if abs(fit.test[0]) > max(_SIGNIFICANT * deviations[12], _LEAST_CHANGE)
+    ][:1]
     fit, deviations, _ = likelier[0]
     offset = step_between(_NOMINAL, fit.platform_from_tags)
     allowed = np.hypot(np.repeat(TAG_FRAME_DEVIATION, 3), deviations[6:12])

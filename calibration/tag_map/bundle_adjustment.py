@@ -25,7 +25,6 @@ from calibration.tag_map.observations import (
 from model.errors import BadInput
 from model.pose import Array, Pose, moved, read_only, skew
 from model.rig import Camera, Rig, Tag
-from tracking.camera_model import rms
 from tracking.detection.tags import tag_corners
 from tracking.pnp import TagView, solve_pnp
 
@@ -49,6 +48,10 @@ def outlier_image(observations: TagObservations, errors: Sequence[float]) -> dic
     if error <= max(_FAR_OFF_PX, 4.0 * float(np.median(errors))):
         return {}
     return {name: f"has a corner error of {error:.2f} px, far more than the others"}
+
+
+def _rms(errors: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def initial_poses(
@@ -214,7 +217,7 @@ class TagLayout:
     @property
     def reprojection(self) -> float:
         """RMS corner error over the images, [px]."""
-        return float(np.sqrt(np.mean(np.square(list(self.errors.values())))))
+        return _rms(list(self.errors.values()))
 
     @property
     def has_failed(self) -> bool:
@@ -296,7 +299,7 @@ class _Fit:
 
     @property
     def error(self) -> float:
-        return float(rms(np.array(self.errors)[:, None])) if self.errors else np.inf
+        return _rms(self.errors) if self.errors else np.inf
 
 
 def _best_fit(
@@ -334,7 +337,7 @@ def _with_fitted_sizes(fit: _Fit, nominal: Sequence[Tag]) -> tuple[Tag, ...] | N
     if fit.error <= GOOD_ERROR:
         return None
     cameras, tags = adjust_bundle(fit.views, fit.cameras, fit.tags, with_sizes=True)
-    error = float(rms(np.array(fit.views.image_errors(cameras, tags))[:, None]))
+    error = _rms(fit.views.image_errors(cameras, tags))
     if error >= min(_BETTER * fit.error, FAILED_ERROR):
         return None
     factors = np.array([tag.size / own.size for tag, own in zip(tags, nominal, strict=True)])
