@@ -299,6 +299,13 @@ def test_an_acceleration_that_is_not_gravitys_is_refused(
         read_rig_data(written(tmp_path / "wrong.csv", data, "m_s2", 1.0), 10)
 
 
+def ones(folder: Path, head: str) -> Path:
+    """A file of one sample with these columns."""
+    path = folder / "samples.csv"
+    path.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
+    return path
+
+
 @pytest.mark.parametrize(
     ("names", "missing"),
     [
@@ -316,9 +323,8 @@ def test_a_measurement_in_another_unit_is_refused_with_the_columns(
     tmp_path: Path, names: str, missing: str
 ) -> None:
     """Not ignored, as other columns are."""
-    path = tmp_path / "samples.csv"
     head = f"actual_1_counts,actual_2_counts,temperature,encoder_x_m,x_axis,{names}"
-    path.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
+    path = ones(tmp_path, head)
     with pytest.raises(BadInput, match=f"{missing}.* missing") as caught:
         read_rig_data(path, 2)
     assert (
@@ -334,13 +340,11 @@ def test_rotations_in_other_columns_are_refused_with_those_to_give(
     tmp_path: Path, names: str
 ) -> None:
     """Half of the measurement would be lost without a word."""
-    path = tmp_path / "samples.csv"
-    head = f"actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,{names}"
-    path.write_text(f"{head}\n{','.join(['1'] * len(head.split(',')))}\n")
+    path = ones(tmp_path, f"actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,{names}")
     with pytest.raises(BadInput, match=r"is of a rotation, but .*qw, qx, qy, qz") as caught:
         read_rig_data(path, 2)
     assert caught.value.next_step.startswith("give rotations as unit quaternions qw, qx, qy, qz")
-    path.write_text("actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,rate_z,ry\n1,1,1,1,1,1,1\n")
+    path = ones(tmp_path, "actual_1_counts,actual_2_counts,x_mm,y_mm,z_mm,rate_z,ry")
     with pytest.raises(BadInput, match="'ry'"):
         read_rig_data(path, 2)
 
