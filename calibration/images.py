@@ -388,11 +388,7 @@ def capture_images(
 
 
 def _captured(folder: Path) -> list[Path]:
-    """The images that earlier sessions captured into a folder.
-
-    Raises:
-        BadInput: It has others too, which a calibration would mix with new ones.
-    """
+    """The images that earlier sessions captured into a folder."""
     images = [path for path in files_in(folder) if path.suffix.lower() in IMAGE_ENDINGS]
     others = [path.name for path in images if not re.fullmatch(r"live_\d{3,}\.png", path.name)]
     if others:

@@ -39,9 +39,7 @@ def page_of(
     """The report page: verdict and next steps first, then the sections.
 
     Args:
-        title: Plain text.
         lead: Plain text below the title.
-        verdict: Of the calibration.
         sections: In order.
         tiles: Key figures, HTML from `model.pages.page.tiles`.
         scripts: As in `model.pages.page.page`.

@@ -207,11 +207,7 @@ def common_keys(
     """The keys common to every result.
 
     Args:
-        name: Name of what was calibrated.
-        on: The date.
-        data_hash: Of the measurements.
         intervals: Estimates with their intervals, by name with unit.
-        verdict: Of the calibration.
         unused: Why data were left out, by name.
         rests_on: The JSON-like parts of the rig file that were taken as known; None for none.
     """

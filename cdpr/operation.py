@@ -213,11 +213,7 @@ def workspace_map(
 
 
 def _plane(given: object) -> tuple[int, float]:
-    """Index of the axis and position [m] of a slice such as ``("z", 0.4)``.
-
-    Raises:
-        BadInput: It is something else.
-    """
+    """Index of the axis and position [m] of a slice such as ``("z", 0.4)``."""
     if isinstance(given, str) or not isinstance(given, Sequence) or len(given) != 2:
         axis = None
     else:

@@ -133,7 +133,6 @@ def bus_fault(what: str, where: str, error: Exception) -> BusFault:
 
     Args:
         what: The operation that failed.
-        where: The bus.
         error: Raised by the back end; its cause may hold the number.
     """
     number = getattr(error, "error_code", None) or getattr(error.__cause__, "errno", None)
@@ -159,7 +158,6 @@ class EchoFilter:
         """Starts without a frame sent.
 
         Args:
-            ids: Identifiers to watch.
             echoes_own_frames: Whether the bus echoes sent frames.
             batch: Largest number of frames of one identifier sent before an echo is read.
         """
@@ -240,7 +238,6 @@ class ErrorFrames:
     """
 
     def __init__(self, bus: can.BusABC) -> None:
-        """Takes the bus."""
         self.total = 0
         self._bus = bus
         self._now = 0

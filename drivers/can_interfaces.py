@@ -114,7 +114,6 @@ def require_usable(name: str, bitrate: int) -> None:
     """Requires what python-can notices only at the first frame, or never.
 
     Args:
-        name: Of the interface.
         bitrate: That of the rig file, [bit/s].
 
     Raises:

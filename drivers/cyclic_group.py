@@ -43,11 +43,9 @@ class ReplyListener(Protocol):
     @property
     def complete(self) -> bool:
         """Whether every drive has answered in this cycle."""
-        ...
 
     def take(self, can_id: int, data: bytes | bytearray, *, stale: bool = False) -> None:
         """Processes one frame; a stale reply belongs to an earlier cycle."""
-        ...
 
 
 class CyclicBus:
@@ -189,7 +187,6 @@ class GroupMonitor(ReplyListener, Protocol):
 
     def end_cycle(self) -> None:
         """Ends a cycle."""
-        ...
 
 
 class CyclicGroup(ABC):

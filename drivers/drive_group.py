@@ -199,12 +199,10 @@ class DriveGroup(Protocol):
     @property
     def capabilities(self) -> Capabilities:
         """Autonomous functions of the drives."""
-        ...
 
     @property
     def state(self) -> GroupState:
         """State of the group."""
-        ...
 
     @property
     def restarted(self) -> tuple[int, ...]:
@@ -212,17 +210,14 @@ class DriveGroup(Protocol):
 
         They were power-cycled since, or never configured.
         """
-        ...
 
     @property
     def stopping(self) -> bool:
         """Whether a stop needs more cycles, as the drives do not finish it themselves."""
-        ...
 
     @property
     def targets(self) -> Counts:
         """Last targets sent, shape (m,), [counts]; motion after ENABLING starts from them."""
-        ...
 
     def configure(
         self, *, to_reset: bool = False, on_restarted: OnRestarted | None = None
@@ -241,7 +236,6 @@ class DriveGroup(Protocol):
             HardwareMissing: A drive does not answer.
             Refused: A drive refuses or changes a setting, or another program moves it.
         """
-        ...
 
     def read_positions(self, pace: Pace | None = None) -> CycleStatus:
         """Waits until every drive has reported its position; changes no state.
@@ -254,7 +248,6 @@ class DriveGroup(Protocol):
             HardwareMissing: A drive does not answer.
             Fault: The bus failed.
         """
-        ...
 
     def send_cycle(
         self, targets: Sequence[int], may_send: Callable[[bool], bool] = lambda _enables: True
@@ -270,7 +263,6 @@ class DriveGroup(Protocol):
         Raises:
             Fault: The bus did not accept a frame.
         """
-        ...
 
     def receive(self, timeout_s: float) -> CycleStatus:
         """Receives the replies of this cycle until all have arrived or the time is over.
@@ -281,7 +273,6 @@ class DriveGroup(Protocol):
         Raises:
             Fault: The bus failed.
         """
-        ...
 
     def command(self, command: GroupCommand) -> None:
         """Sets the goal of the group, reached in steps of one cycle by all drives together.
@@ -289,7 +280,6 @@ class DriveGroup(Protocol):
         Raises:
             Refused: The command would make the platform less safe.
         """
-        ...
 
     def require_releasable(self) -> None:
         """Checks whether RELEASE may be commanded at the present positions.
@@ -297,7 +287,6 @@ class DriveGroup(Protocol):
         Raises:
             Refused: It would make the platform less safe.
         """
-        ...
 
     def quick_stop_now(self) -> None:
         """Sends the stop to all drives in one batch, without waiting.
@@ -305,17 +294,14 @@ class DriveGroup(Protocol):
         Raises:
             Fault: The bus did not accept a frame; the others were still sent.
         """
-        ...
 
     @property
     def ending(self) -> frozenset[int]:
         """Indices of drives that have not confirmed the end of their monitoring."""
-        ...
 
     @property
     def is_monitored(self) -> bool:
         """Whether drives still monitor this master, until all have confirmed the end."""
-        ...
 
     def read_state(self, pace: Pace) -> CycleStatus:
         """Reads the state of every drive after the last cycle, without sending another.
@@ -329,8 +315,6 @@ class DriveGroup(Protocol):
         Raises:
             Fault: The bus failed.
         """
-        ...
 
     def close(self) -> None:
         """Detaches from the bus, which the caller owns, without sending anything."""
-        ...

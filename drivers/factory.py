@@ -73,7 +73,6 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
     CiA 402 drives are then in quick stop under torque; ODrives are idle, and a brake holds.
 
     Args:
-        rig: The robot.
         status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":
@@ -102,7 +101,6 @@ def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     None for ODrives: they hold by closed brakes.
 
     Args:
-        rig: The robot.
         status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":
@@ -124,7 +122,6 @@ def may_have_released(rig: Rig, missing: Sequence[bool]) -> tuple[int, ...]:
     """Nodes of silent drives without a brake: one that lost its power has released its cable.
 
     Args:
-        rig: The robot.
         missing: Whether each drive did not answer.
     """
     rows = zip(rig.winches, missing, strict=True)
@@ -144,7 +141,6 @@ def unready_remarks(rig: Rig, status_words: Sequence[int]) -> list[str]:
     None for ODrives, whose states name it.
 
     Args:
-        rig: The robot.
         status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":
@@ -166,7 +162,6 @@ def blocked_in_fault(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     None for ODrives: if one disarms itself, all are disarmed.
 
     Args:
-        rig: The robot.
         status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":

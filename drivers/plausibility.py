@@ -210,7 +210,6 @@ def require_within_limits(rig: Rig, positions: Mapping[int, int], left: str) -> 
     """Refuses a drive beyond its position limits: it would move to them, or take it as a fault.
 
     Args:
-        rig: The robot.
         positions: By index of the drive, [counts].
         left: The state that the drives are left in.
 

@@ -90,10 +90,8 @@ def wrong_setting(
     """A drive holds a wrong value of a setting.
 
     Args:
-        node: Of the drive.
         setting: Such as ``object 6007h:00 abort connection option code``.
         found: Value in the drive.
-        wanted: Required value.
         why: Reason for the required value.
         next_step: What the user can do now.
     """
@@ -140,7 +138,6 @@ class Refusals:
     """Collects refusals of drives, so that one message reports all."""
 
     def __init__(self) -> None:
-        """Starts empty."""
         self._found: list[Refused] = []
 
     def note(self, action: Callable[..., object], *arguments: Any) -> bool:

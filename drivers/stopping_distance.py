@@ -128,7 +128,6 @@ def stopping_remarks(
     Args:
         rig: The robot, whose motion has the path's speed.
         loads: Payloads carried along the path.
-        waypoints: Of the path.
         clearance: Proved for the whole path, [m]; infinite without obstacles.
         margin: Smallest capacity margin of the path, [N].
     """
@@ -176,7 +175,6 @@ def require_stopping_room(rig: Rig, clearance: float, coasting: float, *, turns:
     """Requires that the platform stops before it touches an obstacle after a loss of the master.
 
     Args:
-        rig: The robot.
         clearance: Proved for the whole path, [m]; infinite without obstacles.
         coasting: The `coasting_distance` along it, [m].
         turns: Whether the platform rotates along it.

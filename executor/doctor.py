@@ -279,7 +279,6 @@ def kernel_bus(settings: BusSettings, interfaces: Sequence[KernelInterface]) -> 
     """Whether the interface of a rig exists, is up, fast enough and healthy.
 
     Args:
-        settings: The rig's bus.
         interfaces: The CAN interfaces of this machine.
     """
     name = settings.channel

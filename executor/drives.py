@@ -124,11 +124,7 @@ class _Drives:
 
 @contextmanager
 def _held_in_process(settings: BusSettings) -> Iterator[None]:
-    """Holds a bus of the interface ``virtual``, whose ends find each other by its name.
-
-    Raises:
-        Refused: Drives are simulated on it already.
-    """
+    """Holds a bus of the interface ``virtual``, whose ends find each other by its name."""
     with _simulating:
         if settings.canonical in _simulated:
             raise Refused(
@@ -187,7 +183,6 @@ def abandoned_drives_fault(document: RigDocument, released: Collection[int]) -> 
     Drives simulated in the process that ended are gone as well.
 
     Args:
-        document: The rig file.
         released: Nodes that need not hold, as they were never enabled.
     """
     rig = rig_from_document(document)
@@ -227,7 +222,6 @@ def open_drives(
     Args:
         rig: The robot and its bus.
         simulated_start: Pose of the platform if the drives are simulated here.
-        load: Its load then.
         to_reset: Also accepts drives in fault, to be reset, and in NMT *stopped*.
         lost_power: Effect of a power loss on drives simulated here.
         configure_as: For unreferenced drives: takes their state before any change, returns the rig
@@ -297,7 +291,6 @@ def unreferenced_drives_of(
     """`open_drives` with picklable arguments, for unreferenced drives.
 
     Args:
-        document: The rig file.
         about: Approximate pose of the platform, ``world_from_platform``.
         limit: Largest tension, [N]; drives that hold more are refused.
         lost_power: Effect of a power loss on drives simulated there.
@@ -321,7 +314,6 @@ def resting_drives_of(
     """`open_drives` with picklable arguments, for drives that stay at rest.
 
     Args:
-        document: The rig file.
         to_reset: As for `open_drives`.
     """
     rig = rig_from_document(document)

@@ -104,9 +104,6 @@ def evaluate(
     written, which would be lost if the program were killed during the evaluation of a long run.
 
     Args:
-        prepared: The run.
-        outcome: Of the motion.
-        seen: Camera records.
         course: Of the run, with its end.
         recorder: Of the run; its cycles are appended, or never will be.
     """
@@ -249,10 +246,8 @@ def write_end(
     """Writes every result file of a run, each as far as possible.
 
     Args:
-        folder: Of the run.
         course: With its end, if there is no evaluation.
         result: The evaluation; None if it failed.
-        events: All events.
         given_up: Called before each file that can be made from the others; True leaves it out.
 
     Returns:

@@ -275,11 +275,7 @@ def require_one_pose(at_home: bool, pose: Pose | None, cameras: Sequence[str]) -
 
 
 def _require_slow(reach: float, speed: float) -> None:
-    """Requires the bounds of the command line for every caller.
-
-    Raises:
-        BadInput: A bound is exceeded.
-    """
+    """Requires the bounds of the command line for every caller."""
     bounds = (("reach", reach, FURTHEST, "m"), ("speed", speed, FASTEST, "m/s"))
     for name, value, largest, unit in bounds:
         if not 0.0 < value <= largest:
@@ -293,11 +289,7 @@ def _require_slow(reach: float, speed: float) -> None:
 def _winding_in(
     rig: Rig, pose: Pose, targets: Array, limit: float, reach: float, speed: float
 ) -> MakeLaw:
-    """The law that winds in slack up to the reach, [m], and the cables' stretch at a pose.
-
-    Raises:
-        Refused: It would take longer than `LONGEST`, as with a stiffness in Pa.
-    """
+    """The law that winds in slack up to the reach, [m], and the cables' stretch at a pose."""
     slowest = float(wind_in_speed(rig, targets, limit, speed).min())
     if reach > LONGEST * slowest:
         raise Refused(
@@ -316,11 +308,7 @@ def _winding_in(
 
 
 def _stated_pose(rig: Rig, pose: Pose | None) -> Pose:
-    """The pose at which a jig holds the platform; the rig's home by default.
-
-    Raises:
-        BadInput: The pose is outside the workspace.
-    """
+    """The pose at which a jig holds the platform; the rig's home by default."""
     if pose is None:
         return rig.home
     inside = (rig.workspace_lower <= pose.position) & (pose.position <= rig.workspace_upper)
@@ -340,10 +328,6 @@ def _targets(rig: Rig, tension: float | None, known: Pose | None, limit: float) 
     By default the tensions planned at the stated pose: the platform stays there when its jig is
     removed, and the next motion begins with the tensions it expects. A platform that hangs free
     moves while cables are wound in, so that their tensions exceed a common, smaller one.
-
-    Raises:
-        Refused: It leaves no headroom below the limit.
-        TensionInfeasible: The cables cannot hold the platform at the pose.
     """
     most = _SHARE_OF_LIMIT * limit
     if tension is None and known is not None:
@@ -375,17 +359,10 @@ def _referenced(
     """The reference at the current pose of the platform.
 
     Args:
-        rig: The robot.
         result: Of the winch motion.
         true_pose: Of the simulated platform.
-        board: Operator requests.
         known: The stated pose; None if a camera measures it.
         source: That camera, from `choose_one_camera`.
-        pictures: Number of images.
-
-    Raises:
-        StoppedByOperator: Stopped by the operator during the measurement.
-        Refused: The pose is too uncertain.
     """
     if known is not None:
         return reference_at(rig, known, result.counts, result.tensions, "stated pose", 0.0)

@@ -231,12 +231,7 @@ def _free_to_turn(scene: Scene, poses: tuple[Pose, ...]) -> Scene:
 
 
 def _require_cable(rig: Rig, cable: int, length: float) -> None:
-    """Requires an existing cable and an allowed length.
-
-    Raises:
-        BadInput: There is no such cable, or the length is zero.
-        Refused: The length is too long.
-    """
+    """Requires an existing cable and an allowed length."""
     if not 1 <= cable <= rig.cable_count:
         raise BadInput(
             f"there is no cable {cable}",

@@ -16,7 +16,6 @@ def ready_to_measure(listener: Listener = SILENT, *, only_missing: bool = False)
     """Loads the tag edge detector, so that no image waits for it.
 
     Args:
-        listener: Receives the wait.
         only_missing: Only compiles it, if necessary: other processes then load it.
     """
     from model.jit import KernelSet, compilation
@@ -33,7 +32,6 @@ def ready_to_simulate(listener: Listener = SILENT, *, only_missing: bool = False
     """Loads the equilibrium solver of the simulated platform, so that no drive waits.
 
     Args:
-        listener: Receives the wait.
         only_missing: As for `ready_to_measure`.
     """
     from model.jit import KernelSet, compilation

@@ -78,7 +78,6 @@ def motion_proposal(
     """Proposal of a run.
 
     Args:
-        prepared: The checked run.
         cameras: In use, with their sources.
         clearance_stop: Whether too small a measured clearance stops the run.
     """
@@ -158,7 +157,6 @@ def homing_proposal(
     """Proposal of a homing.
 
     Args:
-        rig: The robot.
         targets: Pretension of each cable, shape (m,), [N].
         limit: Largest tension, [N].
         reach: Largest length of cable wound in, [m].
@@ -209,7 +207,6 @@ def cable_proposal(rig: Rig, cable: int, length: float, limit: float, speed: flo
     """Proposal to move one winch.
 
     Args:
-        rig: The robot.
         cable: Its number, from 1.
         length: To pay out, [m]; negative winds in.
         limit: Largest tension of any cable, [N].
@@ -233,7 +230,6 @@ def jog_proposal(rig: Rig, scene: Scene, start: Pose) -> Proposal:
 
     Args:
         rig: The robot; its motion has the jog speed.
-        scene: Obstacles and load.
         start: Present platform pose, ``world_from_platform``.
     """
 
@@ -280,7 +276,6 @@ def reset_proposal(bus: str, latched: LatchedFault | None) -> Proposal:
     """Proposal to reset a fault.
 
     Args:
-        bus: Interface and channel.
         latched: The latched fault, if any.
     """
     cause = f"latched since {latched.since}: {latched.cause}" if latched else "no fault latched"
@@ -294,8 +289,6 @@ def release_proposal(
     """Proposal to release the drives.
 
     Args:
-        rig: The robot.
-        bus: Interface and channel.
         braked: Whether brakes hold the drums afterwards.
         reference: Homing reference, which is discarded without brakes.
         in_fault: Names of drives that stay in fault, and cannot be reset before the release.

@@ -172,10 +172,8 @@ def run_prepared(
     A run refused before anything moved leaves no folder.
 
     Args:
-        prepared: The checked run.
         make_folder: See `executor.run_result.folder_maker`.
         cameras: From `resolve_cameras`; empty for none.
-        options: Of the run.
         commands: Those taken since the start of the verb.
 
     Raises:

@@ -78,7 +78,6 @@ class Machine:
     """State of the run, whether it was stopped and whether a fault is latched."""
 
     def __init__(self) -> None:
-        """Starts in READY."""
         self._state = State.READY
         self._stopped = False
         self._faulted = False

@@ -93,7 +93,6 @@ class LocalRequests:
     """Board of a loop in this process; other threads may write to it at any time."""
 
     def __init__(self) -> None:
-        """Starts without requests."""
         # One attribute each: a signal that interrupts one request cannot undo another.
         self._stop, self._hold, self._speed = False, False, 1.0
         self._for_what: StopReason | None = None

@@ -180,7 +180,6 @@ def track_sources(
     """Measures the platform's pose image by image, by one camera or several together.
 
     Args:
-        rig: The robot.
         sources: A folder, a video file, a camera's index or address, or ``synthetic``, for each
             camera; see `executor.cameras.sources.parse_camera_sources`.
         scene: Obstacles for the clearance; None for the plan's.
@@ -306,10 +305,6 @@ def _times_by_name(folders: Mapping[str, ImageFolder], listener: Listener) -> di
 
     Returns:
         By file name, increasing in the order of each folder, [s].
-
-    Raises:
-        BadInput: Of a camera's images, or of the most that another camera has if these are fewer,
-            less than half have a namesake.
     """
     names = {camera: folder.names for camera, folder in folders.items()}
     count = Counter(name for own in names.values() for name in own)

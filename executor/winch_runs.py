@@ -92,7 +92,6 @@ def move_by_law(
         speed: Fastest winch, [m/s].
         realtime: False for simulated time.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
-        listener: Receives progress.
         lost_power: Effect of a power loss on simulated drives.
         rehome: The drives are referenced again afterwards.
         at_rest: See `AtRest`.
@@ -127,7 +126,6 @@ def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) ->
     """Moves while the supervisor can request a stop.
 
     Args:
-        rig: The robot.
         commands: Those taken since the start of the verb.
         move: Moves until the drives hold on their own.
 
@@ -185,15 +183,11 @@ def move_supervised(
     """Moves while the command socket accepts requests such as `cdpr stop`, and records it.
 
     Args:
-        rig: The robot.
         commands: Those taken since the start of the verb.
-        task: For the drives.
         make_drives: Opens them; takes a `listener` where it is called in this process.
         status: Answers on the command socket.
         name: Of the record folder in ``runs``; simulated drives leave none.
-        clock: For simulated time.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
-        listener: Receives events.
         showing: Called after every cycle, before the status.
         presses: Where the command socket writes held controls.
         unreported: Codes of events that the listener does not get.

@@ -116,7 +116,6 @@ def camera_by_name(cameras: Sequence[Camera], name: str | None, where: str) -> C
     """The camera of a name; the first when no name is given.
 
     Args:
-        cameras: Of a rig.
         name: Of the camera in the rig file.
         where: The rig, for messages.
 
@@ -178,7 +177,6 @@ def generic_camera(size: tuple[int, int], name: str = "camera") -> Camera:
 
     Args:
         size: Width and height of its images, [px].
-        name: For messages.
     """
     width, height = size
     matrix = np.array([[width, 0.0, width / 2], [0.0, width, height / 2], [0.0, 0.0, 1.0]])
@@ -224,7 +222,6 @@ def lens_remarks(own: CameraDocument, new: CameraDocument, file: str, assumed: s
     Args:
         own: The camera with its former lens.
         new: The same camera with the lens of a file.
-        file: The file's name.
         assumed: What the file does not state and what is assumed instead; empty if nothing.
     """
     remarks = [f"{file} has no {assumed}"] if assumed else []
@@ -249,37 +246,30 @@ class CalibrationResult(Protocol):
     @property
     def order(self) -> int:
         """Results of lower order are applied first: those of higher order depend on them."""
-        ...
 
     @property
     def kind(self) -> str:
         """What was calibrated, such as ``camera``."""
-        ...
 
     @property
     def name(self) -> str:
         """Which of its kind, such as the camera's name."""
-        ...
 
     @property
     def follows(self) -> str:
         """Name of the result of its kind that is applied before, if given; empty for none."""
-        ...
 
     @property
     def date(self) -> str:
         """Date of the calibration, ISO 8601."""
-        ...
 
     @property
     def verdict(self) -> str:
         """What it is good for, in a sentence."""
-        ...
 
     @property
     def good_enough(self) -> bool:
         """Whether its verdict is good."""
-        ...
 
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with this result applied."""
@@ -292,7 +282,6 @@ class FinishedCalibration(Protocol):
     @property
     def result(self) -> CalibrationResult:
         """As written to the file."""
-        ...
 
 
 Result = TypeVar("Result", bound=CalibrationResult)

@@ -93,7 +93,6 @@ def distinct_figures(values: Sequence[float], digits: int, kind: str = "f") -> l
     """Numbers as text, with more digits where those that differ would look alike.
 
     Args:
-        values: The numbers.
         digits: Fewest decimals, or fewest significant digits with ``kind`` "g".
         kind: Of the format: "f" or "g".
     """
@@ -298,10 +297,7 @@ def positive_number(
 
     Args:
         name: As the message names it.
-        value: The number.
-        unit: Of the number.
         or_zero: Whether it may be 0.
-        most: The largest allowed.
 
     Raises:
         BadInput: It is not such a number, or NaN.

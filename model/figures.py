@@ -32,7 +32,6 @@ def rig_figure(rig: Rig, pose: Pose, scene: Scene | None = None) -> Figure:
     """The rig at a pose, among the obstacles of a scene.
 
     Args:
-        rig: The robot.
         pose: ``world_from_platform``.
         scene: Its obstacles are drawn.
     """

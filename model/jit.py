@@ -68,7 +68,6 @@ def delete_unused(parent: Path, now: float) -> None:
     """Deletes the folders of versions that no process holds and none used for `UNUSED`.
 
     Args:
-        parent: Of the folders.
         now: Seconds since the epoch.
     """
     for folder in parent.iterdir():
@@ -131,7 +130,6 @@ def compiled(
     """Compiles a pure function at its first call; exact IEEE arithmetic, no GIL.
 
     Args:
-        function: The function.
         called: Folders of the kernels that it calls, beside its own.
         counts_arrays: Whether it creates or keeps arrays, whose references are then counted.
         is_inlined: Whether it is inlined into its callers.

@@ -412,7 +412,6 @@ def axis_distances(rig: Rig, anchors: Array) -> Array:
     """Distances of anchors from the swivel axes of their pulleys.
 
     Args:
-        rig: The robot.
         anchors: World frame, shape (..., m, 3), [m].
 
     Returns:

@@ -56,11 +56,7 @@ def hidden_package(error: ImportError) -> tuple[str, str] | None:
 
 
 def _imported(module: str) -> ModuleType:
-    """A module of this project.
-
-    Raises:
-        ImportError: A file or folder of the user hides one of our packages.
-    """
+    """A module of this project."""
     try:
         return import_module(module)
     except ImportError as error:

@@ -64,7 +64,6 @@ def point_of(name: str, given: ArrayLike) -> Array:
     """A point or a displacement, shape (3,), [m].
 
     Args:
-        name: Of the argument.
         given: What a script passes for it.
 
     Raises:

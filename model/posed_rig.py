@@ -87,7 +87,6 @@ def posed_rig(rig: Rig, pose: Pose, load: Load | None = None) -> PosedRig:
     """Kinematics and statics of a rig at one pose.
 
     Args:
-        rig: The robot.
         pose: ``world_from_platform``.
         load: Payload and external wrenches; only the platform's weight when left out.
 

@@ -44,7 +44,6 @@ class Listener:
         """Context of a step with measured progress; yields the function that moves the bar.
 
         Args:
-            text: Before the bar.
             total: Value at the end, or None where unknown.
         """
         return nullcontext(_ignored)

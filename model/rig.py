@@ -223,11 +223,7 @@ class Rig(ReadOnly):
         return torques
 
     def _of_cables(self, name: str, given: ArrayLike) -> Array:
-        """An argument as an array, shape (..., m).
-
-        Raises:
-            BadInput: It is something else.
-        """
+        """An argument as an array, shape (..., m)."""
         try:
             values = floats_of(given)
         except (TypeError, ValueError):

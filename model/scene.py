@@ -373,7 +373,6 @@ class HasDocument(Protocol):
 
     def remade(self) -> object:
         """The same, from its document."""
-        ...
 
 
 def require_unaltered(*things: HasDocument | None) -> None:

@@ -32,7 +32,6 @@ def whole_lengths(rig: Rig, lengths: Array) -> Array:
     """Lengths of cables from drum to anchor, shape (..., m), [m].
 
     Args:
-        rig: The robot.
         lengths: From outlet to anchor, shape (..., m), [m].
     """
     return np.asarray(lengths + [winch.drum_to_outlet for winch in rig.winches])
@@ -45,7 +44,6 @@ class WinchMap:
         """Computes the reference at home.
 
         Args:
-            rig: The robot.
             stiffness: E·A of each cable, shape (m,), [N]; the rig file's when left out.
 
         Raises:

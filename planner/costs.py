@@ -178,7 +178,6 @@ def margin_reserve(rig: Rig, load: Load | None, *, turns: bool) -> float:
     proofs at least.
 
     Args:
-        rig: The robot.
         load: Payload; none when left out.
         turns: Whether the search rotates the platform.
     """
@@ -294,29 +293,23 @@ class RoundSearch(Protocol):
     @property
     def path(self) -> Array | None:
         """The best path, shape (k, n); None without one."""
-        ...
 
     @property
     def length(self) -> float:
         """Length of the best path, [m]; infinite without one."""
-        ...
 
     @property
     def checks(self) -> int:
         """Number of edges checked."""
-        ...
 
     def advance(self) -> None:
         """Does one round."""
-        ...
 
     def weigh(self, weights: Weights) -> None:
         """Changes the weights of the objective."""
-        ...
 
     def cost_by(self, weights: Weights) -> float:
         """Cost of the best path by other weights."""
-        ...
 
 
 Search = TypeVar("Search", bound=RoundSearch)

@@ -44,7 +44,6 @@ def edge_problem(
 
     Args:
         world: Rig, orientation and obstacles.
-        robot: Self clearance.
         load: What the cables must hold.
         holding: Where that is already proved.
         start: World frame, shape (3,), [m].
@@ -76,8 +75,6 @@ def rotating_edge_problem(
     """What forbids a straight move with a steady rotation; see `edge_problem`.
 
     Args:
-        world: Rig and obstacles.
-        robot: Self clearance.
         load: What the cables must hold.
         reserve: Smallest capacity margin, [N].
         start: World frame, shape (3,), [m].
@@ -120,8 +117,6 @@ class ExactChecks:
         """Computes planes and proofs once.
 
         Args:
-            rig: The robot.
-            scene: Obstacles and load.
             rotation: Orientation under translation, ``world_from_platform``, shape (3, 3).
             obstacle_clearance: Of cables and platform to obstacles, [m].
             self_clearance: Between cables and of cables to the platform, [m].

@@ -60,7 +60,6 @@ def require_usable_ends(rig: Rig, scene: Scene, *, free_rotation: bool = False) 
     The cables must hold the platform at a stop with the load it brings and the load it leaves with.
 
     Args:
-        rig: The robot.
         scene: Start, stops and goal.
         free_rotation: Whether they may differ in orientation.
 

@@ -82,12 +82,10 @@ def plan_segments(
     """Plans every leg with its own load.
 
     Args:
-        rig: The robot.
         legs: In order.
         settings: Planner and settings of each leg.
         kinematic: The cost of poses at the legs' orientation.
         progress: Called with the progress of each leg's search.
-        clock: Seconds.
 
     Raises:
         NoSolution: A leg has no path, or its search ended at its limit; the error names the leg.
@@ -186,7 +184,6 @@ def make_plan(
     budget is spent, and the plan then states the rounds that reproduce its path.
 
     Args:
-        rig: The robot.
         scene: Obstacles, clearances, load, start, stops and goal.
         settings: Planner and settings; the recommended planner when left out. A budget applies to
             each leg between stops.

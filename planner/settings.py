@@ -39,9 +39,6 @@ def whole_number(name: str, value: int, least: int = 0, most: int = WHOLE_LARGES
 
     Args:
         name: Of the value, for the message.
-        value: The number.
-        least: Smallest allowed.
-        most: Largest allowed.
 
     Raises:
         BadInput: It is not a whole number, or outside the limits.
@@ -82,11 +79,7 @@ class PlannerSettings:
     readings: AlgorithmVariant = DEFAULT
 
     def __post_init__(self) -> None:
-        """Refuses unusable settings.
-
-        Raises:
-            BadInput: A name is unknown, a size is not positive, or a number is out of range.
-        """
+        """Refuses unusable settings."""
         known = {
             "sampler": ("adaptive", "goal-bias"),
             "cost": ("kinematic", "length"),
@@ -129,12 +122,7 @@ class Weights:
     capacity: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses weights that leave nothing to minimise.
-
-        Raises:
-            BadInput: A weight is negative or larger than files hold, or neither the length nor
-                the kinematic cost has one.
-        """
+        """Refuses weights that leave nothing to minimise."""
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not 0.0 <= value <= LARGEST:
@@ -201,11 +189,7 @@ class AnytimeSettings:
     rounds: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuses unusable settings.
-
-        Raises:
-            BadInput: The seed or the rounds are out of range, or a limit is not positive.
-        """
+        """Refuses unusable settings."""
         object.__setattr__(self, "seed", whole_number("the seed", self.seed, most=SEED_LARGEST))
         if not 0.0 < self.budget * 1e3 <= LARGEST:
             what = f"the budget must be above 0 ms and finite, it is {self.budget * 1e3:g} ms"

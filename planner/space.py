@@ -27,11 +27,9 @@ class Space(Protocol):
 
     def pose(self, coordinates: Array) -> Pose:
         """The pose at coordinates, shape (n,)."""
-        ...
 
     def coordinates(self, pose: Pose) -> Array:
         """The coordinates of a pose, shape (n,)."""
-        ...
 
 
 class PoseSpace:
@@ -118,7 +116,6 @@ def corners_and_weights(lattice: Lattice, points: Array) -> tuple[NDArray[np.int
     """Indices of the eight lattice points around each point, and their trilinear weights.
 
     Args:
-        lattice: The lattice.
         points: Shape (k, 3), [m]; outside the box the nearest cell is used.
 
     Returns:

@@ -191,8 +191,6 @@ class PowerLoss:
         """A random power loss.
 
         Args:
-            rig: The robot.
-            seed: Random seed.
             most_slack: Largest slack of a cable, [m].
             on_a_stand: Whether a support holds the platform.
         """

@@ -113,7 +113,6 @@ class Suspension:
 
         Args:
             pose: ``world_from_platform``.
-            cables: The cables there.
             rates: Stiffness of each cable, 0 if slack, shape (m,), [N/m].
             tensions: Shape (m,), [N].
         """

@@ -75,16 +75,13 @@ class WinchDrive(Protocol):
     @property
     def state(self) -> Enum:
         """State in terms of its protocol."""
-        ...
 
     @property
     def torque_on(self) -> bool:
         """The motor holds or moves the cable; otherwise the brake does."""
-        ...
 
     def advance(self, elapsed: float) -> None:
         """Advances time, [s]."""
-        ...
 
 
 Frame = bytes | bytearray

@@ -152,7 +152,6 @@ def ray_slopes(camera: Camera, rays: Array) -> Array:
     """Derivatives of rays through given pixels by fx, fy, cx, cy and the distortion.
 
     Args:
-        camera: The camera.
         rays: Their intersections with the plane 1 m in front of it, shape (p, 2), [m].
 
     Returns:
@@ -181,7 +180,6 @@ def image_slopes(camera: Camera, points: Array) -> Array:
     """Derivatives of image pixels by points in front of the camera.
 
     Args:
-        camera: The camera.
         points: Camera frame, shape (..., 3), [m].
 
     Returns:
@@ -209,7 +207,6 @@ def pose_slopes(camera: Camera, points: Array, pose: Pose) -> Array:
     """Derivatives of undistorted pixels by shift [m] and rotation [rad], camera axes.
 
     Args:
-        camera: The camera.
         points: In the body's frame, shape (..., 3), [m].
         pose: ``camera_from_body``.
 
@@ -238,7 +235,6 @@ def undistorted_slopes(camera: Camera, undistorted: Array) -> Array:
     """Derivatives of undistorted pixels by the lens parameters, as in `ray_slopes`.
 
     Args:
-        camera: The camera.
         undistorted: Pixels without distortion, shape (p, 2), [px].
 
     Returns:
@@ -270,7 +266,6 @@ def reprojection_errors(camera: Camera, points: Array, undistorted: Array) -> Ar
     """Errors of points in the image, lens distortion included.
 
     Args:
-        camera: The camera.
         points: In front of it, camera frame, shape (..., 3), [m].
         undistorted: Where they are measured, shape (..., 2), [px] without distortion.
 
@@ -285,7 +280,6 @@ def sight_offsets(camera: Camera, points: Array, undistorted: Array) -> Array:
     """Offsets of points from the lines of sight through pixels without distortion.
 
     Args:
-        camera: The camera.
         points: Camera frame, shape (n, 3), [m].
         undistorted: Shape (n, 2), [px].
 
@@ -341,9 +335,7 @@ def require_image_format(image: Image, camera: Camera, rig: str) -> None:
     """Refuses an image of another format than the camera's.
 
     Args:
-        image: The image.
         camera: The camera it should be from.
-        rig: Name of the rig.
 
     Raises:
         BadInput: It is not an array of grey 8-bit pixels of the camera's size, or some are masked.
@@ -376,7 +368,6 @@ def linear(camera: Camera, image: Image) -> Image:
     and white there is less than half the light.
 
     Args:
-        camera: Of the image.
         image: Grey, shape (h, w).
     """
     return image if camera.gamma == 1.0 else _by_table(image, _decoding(camera.gamma))

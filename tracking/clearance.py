@@ -105,7 +105,6 @@ def clearance_at(
     effect.
 
     Args:
-        model: Robot and scene.
         pose: ``world_from_platform``.
         covariance: Of position and rotation vector about world axes, shape (6, 6), [m, rad].
         allowance: Added for errors outside the covariance, [m].
@@ -193,7 +192,6 @@ def require_stated_errors(
     """Refuses to measure with unknown errors.
 
     Args:
-        rig: Its tags.
         cameras: That measure.
         use: What they are to do.
         then: The step after a change of the rig file.

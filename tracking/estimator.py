@@ -80,7 +80,6 @@ def find_consensus(
     """The largest set of squares that agree on one possible pose of the body.
 
     Args:
-        camera: The camera.
         views: Squares with the tags of their numbers; a tag may appear more than once.
         possible: Whether ``camera_from_body`` is a possible pose.
     """
@@ -189,7 +188,6 @@ class PlatformEstimator:
         """The pose from detected tags, and from tags that the detector missed.
 
         Args:
-            image: The image.
             time: Capture time, [s].
             detections: Of the detector; empty if it was not run.
             expected: Expected pose, ``world_from_platform``, to resolve mirror poses, and to start

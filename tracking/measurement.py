@@ -150,7 +150,6 @@ def predict(last: PoseMeasurement, before: PoseMeasurement | None, time: float) 
     """The pose at a time, extrapolated with the velocity between two measurements.
 
     Args:
-        last: The newest measurement.
         before: The one before it, if there is one.
         time: Of the prediction, [s].
     """
@@ -171,7 +170,6 @@ def extrapolate(
     """A measurement extrapolated to a later time, with its covariance.
 
     Args:
-        last: The measurement.
         before: The one before it by the same camera, if there is one.
         time: Of the result, [s]; not before the measurement's own.
 
@@ -206,7 +204,6 @@ class FrameRate:
     """Frame rate and measuring time of the newest images."""
 
     def __init__(self) -> None:
-        """Starts without images."""
         self._times: deque[float] = deque(maxlen=NEWEST)
         self._seconds: deque[float] = deque(maxlen=NEWEST)
 
@@ -274,8 +271,6 @@ def rejection_reason(
     """Why a pose is rejected; empty when it is accepted.
 
     Args:
-        limits: Acceptance limits.
-        views: The tags used.
         bundle: The pose, in the camera frame.
         prior: Pose expected from camera measurements, in the same frame; it resolves mirror poses.
         measured: Number of edges found on these tags and on those that were left out.

@@ -114,8 +114,6 @@ def correct_rolling_shutter(
     """Views as with a global shutter at the middle row's time.
 
     Args:
-        camera: The camera.
-        views: As detected.
         pose: Approximate ``world_from_platform`` at the middle row's time.
         motion: Of the platform during the exposure.
     """
@@ -195,7 +193,6 @@ class RollingShutter:
 
         Args:
             rig: Gives the platform's largest speed.
-            camera: The camera.
             recent: Recent motion of the platform.
         """
         self._camera, self._recent = camera, recent
@@ -211,7 +208,6 @@ class RollingShutter:
 
         Args:
             time: Of the middle row, [s].
-            views: As detected.
             start: A guess of ``camera_from_platform``.
             fit: Finds the pose of views.
         """

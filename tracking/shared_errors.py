@@ -72,7 +72,6 @@ class SharedErrors:
 
         Args:
             pose: The measured pose, ``world_from_platform``.
-            views: The tags used.
         """
         if self.operator_error is not None:
             return read_only(np.diag([(self.operator_error / Z_95) ** 2] * 3 + [0.0] * 3))
@@ -109,7 +108,6 @@ class SharedErrors:
 
         Args:
             bundle: The pose in the camera frame.
-            views: The tags used.
         """
         return bundle.covariance_if(self.expected_cost(bundle, views))
 
@@ -135,8 +133,6 @@ def moved_by_pixels(camera: Camera, views: Sequence[TagView], pose: Pose, shifts
     """Change of a fitted pose with shifts of its corners, to first order.
 
     Args:
-        camera: The camera.
-        views: The tags.
         pose: ``camera_from_body`` that fits them.
         shifts: Of each tag's undistorted corners by each of k causes, shape (t, 8, k), [px].
 
@@ -150,8 +146,6 @@ def expected_cost(camera: Camera, views: Sequence[TagView], pose: Pose, shifts: 
     """Expected cost of a fitted pose whose corners have known errors beside their scatter.
 
     Args:
-        camera: The camera.
-        views: The tags.
         pose: ``camera_from_body`` that fits them.
         shifts: Of each tag's undistorted corners by each of k independent causes of unit variance,
             shape (t, 8, k), [px].
@@ -206,7 +200,6 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
     The tag's shift and its rotation each contribute half of the squared corner error.
 
     Args:
-        tag: The tag.
         error: Of its corners, 95 %, RMS, [m].
     """
     arms = tag_corners(tag) - tag.pose.position
@@ -260,7 +253,6 @@ def displaced_tag(
     size, number or pose is a square: its edges fit each other at some pose, but not at this one.
 
     Args:
-        camera: The camera.
         views: Tags with all their measured edges.
         pose: ``camera_from_body``.
         expected: Squared error of an edge, in variances.
@@ -377,11 +369,9 @@ def require_unmoved_camera(
     next one in the same manner.
 
     Args:
-        camera: The camera.
         views: Of frame tags.
         limit_px: Largest median error of the tags.
         before: The check of the last image; None if it passed.
-        family: Of the tags.
 
     Returns:
         The check, or None if no frame tag is completely visible.

@@ -42,22 +42,18 @@ class SourceImage(Protocol):
     @property
     def time(self) -> float:
         """Capture time, [s]."""
-        ...
 
     @property
     def image(self) -> Image:
         """Grey image."""
-        ...
 
     @property
     def name(self) -> str:
         """File name or number."""
-        ...
 
     @property
     def number(self) -> int:
         """Number in the source, from 0."""
-        ...
 
 
 class NoPlatformSeen(BadInput):
@@ -134,7 +130,6 @@ class NoPoseReasons:
     """Reasons for missing poses; those that differ in numbers only are one."""
 
     def __init__(self) -> None:
-        """Starts without any."""
         self._counts: Counter[str] = Counter()
         self._first: dict[str, str] = {}
 
@@ -323,8 +318,6 @@ def draw_measurement(
 
     Args:
         image: Grey image of the camera.
-        rig: The robot.
-        camera: The camera.
         found: The measurement in the image.
         clearance: At the measured pose, if the scene has obstacles.
 

@@ -52,7 +52,6 @@ class EncoderPrior:
     """Expected pose from the encoders, corrected by the last camera measurement."""
 
     def __init__(self) -> None:
-        """Starts without a correction."""
         self._shift: Array = np.zeros(3)
         self._turn: Array = np.eye(3)
 
@@ -90,7 +89,6 @@ class EncoderExtrapolator:
     """Extrapolates the encoder pose to the time of an image."""
 
     def __init__(self) -> None:
-        """Starts without a pose."""
         self._last: tuple[float, Pose] | None = None
 
     def at(self, picture: float, heard: float, pose: Pose | None) -> Pose | None:

@@ -178,7 +178,6 @@ def locate_by_pairs(
         reference: Its pose is taken as known.
         pairs: Observations by this camera and by the other at the same time, by image name.
         unused: Why other images are not used.
-        hash_of_data: Of the observations.
 
     Raises:
         BadInput: Too few pairs.

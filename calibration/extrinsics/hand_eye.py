@@ -164,7 +164,6 @@ class _HandEyeFit:
         """Standard deviations of the unknowns, shape (u,), with those from a stated lens.
 
         Args:
-            camera: The camera.
             by_lens: As `_PoseObservation.by_lens`, of all images, shape (n, 6, m).
         """
         covariance, count = np.asarray(np.linalg.inv(self.information)), len(self.errors)
@@ -183,9 +182,7 @@ def locate_by_motion(
     """Finds a camera's pose from images of the platform at known poses.
 
     Args:
-        rig: Its platform tags.
         camera: Its matrix and distortion are taken as known; its pose in the rig file is not used.
-        observations: Of platform tags.
         poses: ``world_from_platform`` at each image.
 
     Raises:
@@ -262,7 +259,6 @@ def _reweighted_fit(
     """The fit, with the noise of the encoder poses estimated from residuals.
 
     Args:
-        stack: The observations.
         start: Initial ``world_from_camera``.
         tags: Initial ``platform_from_tags``.
         deviations: Of the tags' frame from the rig file, [m] and [rad].

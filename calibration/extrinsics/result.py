@@ -109,7 +109,6 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
     """The verdict on a camera's pose.
 
     Args:
-        result: The calibration.
         wanted: Required error in the work space, [m].
     """
     issues, error = list(result.issues), result.error
@@ -236,10 +235,7 @@ def extrinsics_result(
     """The result file's content.
 
     Args:
-        result: The calibration.
-        verdict: Of the calibration.
         rig: The rig file's content used for the calibration.
-        on: The date.
     """
     name = result.camera.name
     return ExtrinsicsResult(
@@ -288,7 +284,6 @@ def _basis(rig: RigDocument, name: str, by: str, reference: str | None) -> dict[
 
     Args:
         rig: The rig file's content.
-        name: The camera.
         by: See `ExtrinsicCalibration`.
         reference: The other camera, if any.
     """
@@ -316,9 +311,7 @@ def extrinsics_page(
     """The report page.
 
     Args:
-        result: The calibration.
         document: The result file's content.
-        verdict: Of the calibration.
         before: ``world_from_camera`` of the rig file.
     """
     pose = document.world_from_camera
@@ -372,8 +365,6 @@ def judged_extrinsics(
     """A finished calibration of a camera's pose, written to a folder where one is given.
 
     Args:
-        found: The fit.
-        rig: The robot.
         camera: As in the rig file.
         wanted: Required error in the work space, 95 %, [m].
         to: Where to write it.

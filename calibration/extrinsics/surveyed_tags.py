@@ -190,11 +190,7 @@ def _rotation_issues(
 
 
 def _without_moved_images(camera: Camera, observations: TagObservations) -> TagObservations:
-    """Without images whose tags have moved relative to the largest group that agrees.
-
-    Raises:
-        BadInput: Half of the images or more have moved.
-    """
+    """Without images whose tags have moved relative to the largest group that agrees."""
     corners = observations.corners(camera)
     groups = [
         [one for one in corners.values() if _shift(one, other) <= MOVED_PX]

@@ -48,7 +48,6 @@ def without_outliers(measured: RigMeasurements, fit: RigFit, fewest: int) -> Rig
     """The samples without outliers, which are listed as unused.
 
     Args:
-        measured: Stationary samples.
         fit: Robust fit of all samples.
         fewest: Nothing is rejected if fewer samples than this would remain.
     """
@@ -257,7 +256,6 @@ def fit_rig(
 
     Args:
         rig: As in its file.
-        measured: Stationary samples.
         deviations: Standard deviation of the rig file by parameter group; groups left out are
             taken as known.
         length_deviation: Of a cable's length from the encoder, with measured tension, [m].
@@ -310,9 +308,6 @@ def _require_within(rig: Rig, measured: RigMeasurements) -> None:
     Until a rig is calibrated, poses at the edge of its workspace are a little outside, and the
     reflector may be so anyway: both have as much room as the platform and the reflector reach.
     Poses close together have none: in metres, they would all be near the world's origin.
-
-    Raises:
-        BadInput: One is outside the box around outlets, home and workspace.
     """
     corners = np.vstack([rig.outlets, rig.workspace_lower, rig.workspace_upper, rig.home.position])
     lower, upper = corners.min(axis=0), corners.max(axis=0)
@@ -333,11 +328,7 @@ def _require_within(rig: Rig, measured: RigMeasurements) -> None:
 
 
 def _require_sensors(rig: Rig, measured: RigMeasurements, deviations: Mapping[str, float]) -> None:
-    """Checks that the rig has what sensors measure, and that an IMU's axes fit the platform's.
-
-    Raises:
-        BadInput: One does not fit.
-    """
+    """Checks that the rig has what sensors measure, and that an IMU's axes fit the platform's."""
     if np.isfinite(measured.swivels).any() and not rig.pulley_radius:
         raise BadInput(
             "the data have swivel angles, but the rig file has no pulleys",

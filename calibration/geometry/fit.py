@@ -169,8 +169,6 @@ class RigFitter:
         """Prepares the model; `fit` runs the fit.
 
         Args:
-            parameters: The unknowns.
-            measured: Stationary samples.
             length_deviation: Of a cable's length from the encoder, [m].
         """
         self._parameters, self._measured = parameters, measured

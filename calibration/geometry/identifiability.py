@@ -162,8 +162,6 @@ def identified(
     """The fit restricted to the directions that the data determine, and these directions.
 
     Args:
-        parameters: The unknowns.
-        measured: Stationary samples.
         length_deviation: Of a cable's length from the encoder, [m].
 
     Raises:
@@ -194,9 +192,7 @@ def pose_scales(measured: RigMeasurements, fit: RigFit, observability: Observabi
     excess beyond that counts. Excess within chance, two standard deviations, does not: 1.
 
     Args:
-        measured: Stationary samples.
         fit: In the directions that the samples determine.
-        observability: These directions.
     """
     numbers, unknowns = _numbers(measured, fit), observability.known.shape[1]
     usual = max(numbers - unknowns, fit.squares, 1.0) / max(numbers, 1)
@@ -316,9 +312,6 @@ def _tension_squares(
     """As in `RigUncertainty`.
 
     Args:
-        parameters: The unknowns.
-        measured: Stationary samples.
-        fit: Their fit.
         moved_by: Changes of the unknowns, shape (p,), by such squares.
         ratio: Of the variance of residuals to the stated one.
     """
@@ -348,11 +341,8 @@ def uncertainty_of_rig(
     """The uncertainty of a fit.
 
     Args:
-        parameters: The unknowns.
-        measured: Stationary samples.
         fit: In the directions that the samples determine; residuals larger than assumed widen the
             result.
-        observability: These directions.
     """
     known, unknown = observability.known, observability.unknown
     informations = known.T @ fit.informations @ known
@@ -411,8 +401,6 @@ def held_out(parameters: Parameters, measured: RigMeasurements, length_deviation
     """Five-fold cross-validation.
 
     Args:
-        parameters: The unknowns.
-        measured: Stationary samples.
         length_deviation: Of a cable's length from the encoder, [m].
 
     Raises:

@@ -263,7 +263,6 @@ def at_rest(name: str, run: Recording) -> RigMeasurements:
 
     Args:
         name: Of the run, for the names of the samples.
-        run: The recording.
     """
     names, rows, unused = [], [], {}
     still = np.all(np.diff(run.setpoints, axis=0) == 0.0, axis=1)
@@ -327,7 +326,6 @@ def read_rig_data(path: Path, cables: int, reflector: Array | None = None) -> Ri
     """Reads the samples of a CSV file; poses without a stated deviation are exact.
 
     Args:
-        path: The file.
         cables: Number of cables of the rig.
         reflector: Point whose positions it contains, such as the target of a tracker, platform
             frame, shape (3,), [m]; the origin when left out.

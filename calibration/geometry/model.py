@@ -125,7 +125,6 @@ class RigAtPoses:
         Args:
             slopes: Derivative by the anchor in the world, shape (n, m, 3); by the outlet it has
                 the opposite sign.
-            parameters: The unknowns.
 
         Returns:
             Shape (n, m, p).
@@ -385,8 +384,6 @@ def tension_variance(
 
     Args:
         rig: As in its file.
-        geometry: The estimated parameters.
-        measured: Stationary samples.
         positions: Of the platform, world frame, shape (n, 3), [m].
         rotations: ``world_from_platform``, shape (n, 3, 3).
 
@@ -418,7 +415,6 @@ def nominal_tensions(rig: Rig, measured: RigMeasurements) -> Array:
 
     Args:
         rig: As in its file.
-        measured: Stationary samples.
 
     Raises:
         TensionInfeasible: The rig cannot hold its platform at home.

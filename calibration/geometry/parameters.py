@@ -214,7 +214,6 @@ def common_changes(parameters: Parameters, values: Array, covariance: Array) -> 
     Measured positions with a wrong scale or in another frame change a rig in this way.
 
     Args:
-        parameters: The unknowns.
         values: Of the unknowns, shape (p,).
         covariance: Of the values, without that of the rig file, shape (p, p).
 

@@ -68,9 +68,7 @@ def choose_poses(
     """Selects the poses, in an order with short paths between them.
 
     Args:
-        rig: The robot.
         scene: Its obstacles, clearances and load.
-        requirements: On the poses.
         parameters: The parameters to estimate.
         seed: Random seed of the candidates.
 

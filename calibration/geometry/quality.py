@@ -81,7 +81,6 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     """Changes of compliances, relative to the rig file's, that the data ask for.
 
     Args:
-        result: The fit.
         groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
     Returns:
@@ -217,7 +216,6 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     """The verdict.
 
     Args:
-        result: The calibration.
         wanted: Required error, 95 %, [m].
         tilt: Largest rotation of the platform from its orientation at home, [rad].
     """

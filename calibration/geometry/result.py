@@ -177,12 +177,6 @@ def _with_numbers(
 def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date) -> RigResult:
     """The result file's content.
 
-    Args:
-        result: The calibration.
-        quality: Its quality.
-        name: Name of the result.
-        on: The date.
-
     Raises:
         Fault: The fit is not physical.
     """

@@ -91,7 +91,6 @@ def uncertainty_of(
         translations: Origins of the board there, shape (3,) each, [m].
         matrix: Camera matrix, shape (3, 3), [px].
         distortion: The lens's coefficients, shape (k,).
-        lens: The lens model.
 
     Raises:
         BadInput: The images do not determine all parameters.
@@ -258,7 +257,6 @@ def refit_camera(
     """Fits a camera again, to corners detected with the lens of the first fit.
 
     Args:
-        first: The first fit.
         pictures: Its images, read again.
         board: As in the first fit.
         lens: As in `fit_camera`.
@@ -315,7 +313,6 @@ def fit_corners(
     """Fits a camera to corners detected by another program.
 
     Args:
-        views: By image name.
         unused: Images already left out, with the reasons.
         size: Width and height of the images, [px].
         lens: As in `fit_camera`.

@@ -266,11 +266,9 @@ def write_rig_with_camera(
 
     Args:
         output: The file to write.
-        rig: The robot.
         name: Of the camera, which keeps its pose and rate.
         path: A file in one of `FORMATS`, detected by content.
         entry: Which camera of Kalibr's camchain or OpenCV's stereo_calib, such as ``cam1``, ``M2``.
-        listener: Receives the remarks.
 
     Raises:
         BadInput: The file cannot be read, has an unknown format, or values out of range; the rig

@@ -99,7 +99,6 @@ def judge_camera(
     """Assesses a calibration.
 
     Args:
-        result: The calibration.
         wanted: Required error, [m].
         distance: Working distance of the camera, [m]; that of the boards when left out. As that
         depends on the stated size of the squares, pixels are assessed as well then.
@@ -178,7 +177,6 @@ def pixel_uncertainty(result: CameraCalibration, pixels: Array) -> Array:
     The rotation that fits best over the whole image is removed.
 
     Args:
-        result: The calibration.
         pixels: Shape (n, 2), [px].
 
     Returns:
@@ -200,7 +198,6 @@ def _slopes(result: CameraCalibration, pixels: Array) -> tuple[Array, Array]:
     """Derivatives of pixels by the camera's parameters and rotation.
 
     Args:
-        result: The calibration.
         pixels: Shape (rays, 2), [px].
 
     Returns:
@@ -257,7 +254,6 @@ def _board_change(
     It is the same in all images, and fitted together with the camera and the board's poses.
 
     Args:
-        result: The calibration.
         shapes: Derivatives of points on the board, shape (n, 3), by the change, shape (n, 3, k).
 
     Returns:

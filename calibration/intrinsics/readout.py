@@ -270,7 +270,6 @@ def judge_readout(found: ReadoutCalibration, wanted: float, speed: float) -> Cal
     """The verdict on a readout.
 
     Args:
-        found: The readout.
         wanted: Required error, [m].
         speed: Platform speed for which the error is stated, [m/s].
     """

@@ -310,10 +310,7 @@ def camera_result(
     """The result file's content.
 
     Args:
-        result: The calibration.
-        quality: Its quality.
         name: Of the camera in the rig file.
-        on: The date.
     """
     m, verdict, unused = result.matrix, quality.verdict, _left_out(result)
     return CameraResult(

@@ -77,7 +77,6 @@ def adjust_bundle(
     """Fitted camera poses and tags; the first tag stays fixed meanwhile.
 
     Args:
-        views: Of the tags.
         cameras: ``camera_from_platform`` of each image, to start from.
         tags: To start from.
         with_sizes: Whether sizes relative to the first tag are fitted, too.

@@ -104,10 +104,7 @@ def tags_result(
     """The result file's content.
 
     Args:
-        result: The measured layout.
-        verdict: Of the calibration.
         rig: The rig file's content used for the measurement.
-        on: The date.
     """
     unseen = {f"tag {number}": why for number, why in result.unseen.items()}
     return TagsResult(
@@ -270,7 +267,6 @@ def judge_layout(result: TagLayout, wanted: float) -> CalibrationVerdict:
     """The verdict on a layout.
 
     Args:
-        result: The measured layout.
         wanted: Required error of tag corners, [m].
     """
     error = result.error

@@ -63,15 +63,12 @@ class Board(Protocol):
             image: The image.
             camera: That took it; one without distortion is assumed when left out.
         """
-        ...
 
     def describe_other(self, image: Image) -> str:
         """What an image without the board shows instead, for messages; empty if unknown."""
-        ...
 
     def __str__(self) -> str:
         """The board, for messages."""
-        ...
 
 
 def is_mirrored(board: Board, image: Image) -> bool:
@@ -169,11 +166,7 @@ class Chessboard:
     needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards.
-
-        Raises:
-            BadInput: Too few inner corners, a square not above 0, or a value of another type.
-        """
+        """Refuses impossible boards."""
         require_fields(self)
         require_board(
             min(self.columns, self.rows) >= 3,
@@ -283,12 +276,7 @@ class Charuco:
     needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards.
-
-        Raises:
-            BadInput: Too few squares, a marker that does not fit its square, a dictionary that is
-                unknown or has too few markers, or another value for ``legacy``.
-        """
+        """Refuses impossible boards."""
         require_fields(self)
         require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")
@@ -412,7 +400,6 @@ def _saddles(image: Image, rough: Array, gaps: Array) -> tuple[Array, NDArray[np
     its saddle point, as long as the smoothing does not reach the markers.
 
     Args:
-        image: Grey image.
         rough: Approximate corners, shape (n, 2), [px].
         gaps: Distance from each to the nearest marker, shape (n,), [px].
 

@@ -69,12 +69,7 @@ class CircleGrid:
     needs_lens: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards.
-
-        Raises:
-            BadInput: Too few circles, a size not above 0, circles that touch, or another value for
-                ``asymmetric``.
-        """
+        """Refuses impossible boards."""
         require_fields(self)
         require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles per side")
         apart = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
@@ -179,7 +174,6 @@ class CircleGrid:
 
         Args:
             turn: Homography from board plane to undistorted pixels, shape (3, 3).
-            camera: Of the image.
 
         Returns:
             Their centroids minus the images of the circles' centres, shape (n, 2), [px], and the
@@ -273,12 +267,7 @@ class TagGrid:
     needs_lens: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards.
-
-        Raises:
-            BadInput: Too few tags, a size not above 0, an unknown family, or numbers outside the
-                family.
-        """
+        """Refuses impossible boards."""
         require_fields(self)
         require_board(self.columns * self.rows >= 4, "a tag grid needs 4 tags")
         require_board(min(self.columns, self.rows) >= 1, "a tag grid needs a row and a column")
@@ -380,7 +369,6 @@ class TagGrid:
         """Largest error of a tag's nearest neighbours, as a share of their distance.
 
         Args:
-            numbers: Of n tags.
             offsets: From `tag_offsets`, shape (n, n, 2).
         """
         middles = self.points_of(numbers).reshape(-1, 4, 3).mean(axis=1)[:, :2] / self.tag

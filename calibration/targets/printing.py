@@ -187,12 +187,7 @@ class Page:
 
 
 def pdf_of(pages: list[Page], title: str) -> bytes:
-    """The PDF file.
-
-    Args:
-        pages: One or more.
-        title: Printable ASCII.
-    """
+    """The PDF file."""
     kids = " ".join(f"{4 + 2 * k} 0 R" for k in range(len(pages)))
     objects = [
         b"<< /Type /Catalog /Pages 2 0 R /ViewerPreferences << /PrintScaling /None >> >>",

@@ -143,7 +143,6 @@ def name_options(error: CdprError, options: Mapping[str, str]) -> None:
     Values of arguments, in SI, are converted to the unit of the option.
 
     Args:
-        error: Modified.
         options: How the user types them, such as ``--budget-ms``, by parameter name.
     """
     by_name = {_UNIT.sub("", name): name for name in options}

@@ -66,8 +66,6 @@ def show_facts(title: str, facts: list[tuple[str, str]], on: Console = out) -> N
     """Prints a result for people: names on the left, values on the right.
 
     Args:
-        title: Heading.
-        facts: Names and values.
         on: `out`, or `err` where standard output is for a program.
     """
     if not on.is_terminal:

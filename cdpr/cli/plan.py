@@ -155,11 +155,7 @@ def _least_rounds(document: PlanDocument) -> list[tuple[str, str]]:
 
 
 def _weights(texts: Sequence[str]) -> dict[str, float]:
-    """Weights of a sum of objectives, by name, from texts ``NAME=NUMBER``.
-
-    Raises:
-        BadInput: One cannot be read, or appears twice.
-    """
+    """Weights of a sum of objectives, by name, from texts ``NAME=NUMBER``."""
     read: dict[str, float] = {}
     for text in texts:
         name, _, number = text.partition("=")
@@ -184,11 +180,7 @@ def _at(position_mm: Triple, other: Pose) -> Pose:
 
 
 def _via_pose(text: str, start: Pose) -> Pose:
-    """The pose at ``x y z``, with the start's orientation.
-
-    Raises:
-        BadInput: It cannot be read.
-    """
+    """The pose at ``x y z``, with the start's orientation."""
     hint = "write --via-mm 0 40 430"
     try:
         x, y, z = map(float, text.split())

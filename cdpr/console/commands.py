@@ -230,7 +230,6 @@ class Newest(Generic[T]):
     """Keeps the newest of several values until it is taken."""
 
     def __init__(self) -> None:
-        """Starts empty."""
         self.value: T | None = None
         self._is_there = asyncio.Event()
 
@@ -260,7 +259,6 @@ class Inbox:
     """
 
     def __init__(self) -> None:
-        """Starts empty."""
         self.commands: asyncio.Queue[tuple[Message, float]] = asyncio.Queue(MOST_WAITING)
         self.to_run: asyncio.Queue[tuple[Message, float]] = asyncio.Queue(MOST_WAITING)
         self.refused: asyncio.Queue[tuple[int, str]] = asyncio.Queue(MOST_WAITING)

@@ -213,7 +213,6 @@ class Console:
 
         Args:
             page: Number of the page.
-            message: The command.
             arrived: When, [s] of `CLOCK_BOOTTIME`; a later stop cancels it unless it has begun.
         """
         if self.files.read_only:
@@ -267,12 +266,7 @@ class Console:
             self._one_at_a_time.release()
 
     def _require(self, page: int, arrived: float, longest: float) -> None:
-        """Requires no stop since a command, control, and a wait of at most ``longest`` [s].
-
-        Raises:
-            Refused: A command that waited, such as for the drives to be read, is not wanted now,
-                or its page has reported that it had no effect.
-        """
+        """Requires no stop since a command, control, and a wait of at most ``longest`` [s]."""
         if self._stopped >= arrived or is_stopped_since(arrived):
             raise Refused(
                 "STOP was pressed before this command began",

@@ -41,7 +41,6 @@ class BusControl:
 
         Args:
             rig: The robot and its bus.
-            pages: Of this console.
             guard: Held while they change.
         """
         self._pages, self._guard = pages, guard
@@ -313,7 +312,6 @@ class StateFlow:
     """
 
     def __init__(self) -> None:
-        """Starts with nothing in transit."""
         self._sent: list[int] = []
         self._has_room = asyncio.Event()
         self._has_room.set()

@@ -143,8 +143,6 @@ class TaughtPoses:
         otherwise the scene has rotation limits, and is to be planned with free rotation.
 
         Args:
-            around: Obstacles and load.
-            name: Of the scene.
             begin: The path's first pose, before the taught ones; None for the first of them.
             only: The one taught pose to go to; None for all.
 
@@ -229,7 +227,6 @@ def picked_pose(rig: Rig, position_mm: list[float], now: Pose) -> Pose:
     """The pose at a picked position, with the platform's present orientation.
 
     Args:
-        rig: The robot.
         position_mm: x, y, z in the world frame.
         now: The present pose, ``world_from_platform``.
 

@@ -146,7 +146,6 @@ class StartedVerb:
         """Starts a verb without a terminal.
 
         Args:
-            verb: Name.
             arguments: On its command line.
             require: Raises `Refused` if it is not to be started any more. A stop after this check
                 finds the verb started, and ends it.

@@ -227,7 +227,6 @@ def commanded_pose(rig: Rig, jog: dict[str, Any], robot: RobotNow) -> Pose:
     """The commanded pose of a jog session, exactly: jogs do not rotate the platform.
 
     Args:
-        rig: The robot.
         jog: See `executor.remote.status`.
         robot: From the encoders.
 
@@ -257,7 +256,6 @@ class LoadedPlan:
     """The plan that a run would follow, and another to compare it with."""
 
     def __init__(self, rig: Rig) -> None:
-        """Before any plan."""
         self._rig = rig
         self.preview: dict[str, Any] | None = None
         self.compared: dict[str, Any] | None = None

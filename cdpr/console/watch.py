@@ -132,7 +132,6 @@ class RunWatch:
             command: See `executor.remote.protocol`.
             received: Time of a report's arrival on the monotonic clock, [s]: one that is too old,
                 because others were sent first, is not sent.
-            values: Of the command.
         """
         with self._lock:
             if self._run is None:
@@ -255,7 +254,6 @@ class RobotWatch:
         """Before any status.
 
         Args:
-            view: Computes the pose.
             read: Reads the drives; None if each run simulates its own.
             pool: Reads them without blocking.
         """
@@ -380,7 +378,6 @@ class CameraImages:
     """
 
     def __init__(self) -> None:
-        """Starts without a run."""
         self._busy = threading.Lock()
         self._rig: Rig | None = None
         self._sources: dict[str, tuple[int, int]] = {}

@@ -76,11 +76,7 @@ class ImageFolder(FrameSource):
         return len(self.files)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields the images that have the camera's size.
-
-        Raises:
-            BadInput: None can be read or has the camera's size, or as `Camera.require_unrotated`.
-        """
+        """Yields the images that have the camera's size."""
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
         none_read = True
@@ -186,7 +182,6 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image | None:
     data say, by 90°, is rotated.
 
     Args:
-        path: The file.
         size: Width and height of the camera's images, [px]; None for as stored.
     """
     return _read(path, size)[0]

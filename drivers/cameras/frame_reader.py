@@ -86,7 +86,6 @@ class ArrivalSchedule:
     """
 
     def __init__(self) -> None:
-        """Starts without images."""
         self._number, self._begin, self._due = -1, 0.0, 0.0
         self._recent: deque[float] = deque()
         self._on_time: deque[tuple[int, float]] = deque()
@@ -162,7 +161,6 @@ class DriverTimes:
     """
 
     def __init__(self) -> None:
-        """Starts without images."""
         self._begin: float | None = None
         self._stated, self._is_rising = 0.0, True
         self._ages: deque[tuple[float, float]] = deque()  # arrivals and ages, both rising
@@ -204,7 +202,6 @@ class CopyCheck:
     """
 
     def __init__(self) -> None:
-        """Starts without images."""
         self.count = 0
         self._last: NDArray[np.generic] | None = None
 

@@ -149,11 +149,7 @@ class VideoFile(FrameSource):
         return sum(1 for _ in self)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields every image.
-
-        Raises:
-            BadInput: They have another size than the camera, or none can be read.
-        """
+        """Yields every image."""
         capture = _opened_video(self._path, self._camera)
         number, seconds, begin = 0, -1.0 / self.rate, 0.0
         try:
@@ -232,11 +228,7 @@ class LiveCamera(FrameSource):
             raise
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields images until stopped; those that arrive late or during processing are skipped.
-
-        Raises:
-            Fault: The camera stopped delivering images.
-        """
+        """Yields images until stopped; those that arrive late or during processing are skipped."""
         with suppress(StoppedByOperator):
             while True:
                 yield self.read()

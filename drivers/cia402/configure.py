@@ -116,7 +116,6 @@ def configure_drives(
 
     Args:
         rig: The robot; its winches name the nodes.
-        bus: An open bus.
         pump: As for `drivers.factory.make_drive_group`.
         max_tension: Tension that sets the torque limit, [N]; the rig's if None.
         to_reset: Accepts drives in fault too, which will be reset.
@@ -268,7 +267,6 @@ def require_objects(
 
     Args:
         rig: The robot; its winches name the nodes.
-        network: The bus.
         others: Index, name and size [bytes] of further objects.
 
     Raises:

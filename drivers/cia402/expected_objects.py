@@ -148,8 +148,6 @@ def require_answers(network: SetupNetwork, nodes: Sequence[int], *, revive: bool
     """Contacts all drives at once, and reports all silent ones together.
 
     Args:
-        network: The bus.
-        nodes: The drives.
         revive: Takes drives that are in NMT *stopped* to *pre-operational*.
 
     Raises:
@@ -373,8 +371,6 @@ def require_idle(network: SetupNetwork, node: int, to_reset: bool, errors: dict[
     """Refuses an enabled drive, which another master controls; quick stop is accepted.
 
     Args:
-        network: The bus.
-        node: The drive.
         to_reset: Accepts a drive in fault.
         errors: Gets the error code of one in fault, by node.
 

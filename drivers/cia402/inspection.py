@@ -153,7 +153,6 @@ def examine_drives(rig: Rig, bus: can.BusABC, pump: Pump | None) -> Examined:
 
     Args:
         rig: The robot, with its drive profile.
-        bus: An open bus.
         pump: As for `drivers.factory.make_drive_group`.
 
     Raises:

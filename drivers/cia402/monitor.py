@@ -66,7 +66,6 @@ class DriveMonitor:
         """Starts without any reply.
 
         Args:
-            names: By node id.
             max_steps: Largest motion of each drive in a cycle, [counts].
             is_warning: Whether an EMCY code is only a warning while the drive stays enabled.
             heartbeat_cycles: Cycles without a drive's heartbeat after which its peers may stop.
@@ -133,8 +132,6 @@ class DriveMonitor:
         """Processes one frame.
 
         Args:
-            can_id: Identifier.
-            data: Data bytes.
             stale: Replies belong to an earlier cycle and are discarded.
         """
         drive = self._replies.get(can_id)

@@ -143,7 +143,6 @@ def settings_for(
     """The settings of one drive, in the order of writing.
 
     Args:
-        rig: The robot.
         drive: Index of its winch in the rig file.
         winch_map: The rig's lengths and counts.
         max_tension: Tension that sets the torque limit, [N]; the rig's if None.
@@ -165,7 +164,6 @@ def stated_absent(
     If a drive has it nevertheless, a value of another program could be active.
 
     Args:
-        rig: The robot.
         drive: Index of its winch in the rig file.
         winch_map: The rig's lengths and counts.
         max_tension: As for `settings_for`.
@@ -213,11 +211,7 @@ LONGEST_QUICK_STOP = 0.5  # from top speed, [s]
 
 
 def _within(setting: Setting, profile: ProfileDocument, cycle: float) -> Setting:
-    """The setting within the drive's range.
-
-    Raises:
-        BadInput: No value in the range is suitable.
-    """
+    """The setting within the drive's range."""
     allowed = profile.range_of(setting.index, setting.sub)
     if allowed is None or allowed.holds(setting.value):
         return setting
@@ -247,7 +241,6 @@ def heartbeat_consumers(rig: Rig, drive: int, entries: int) -> tuple[Setting, ..
     if a loss would remove the torque. The drive may lack those that its profile leaves out.
 
     Args:
-        rig: The robot.
         drive: Index of the winch in the rig file.
         entries: Number of entries that the drive states (1016h:00).
     """

@@ -86,7 +86,6 @@ def power_bits(profile: ProfileDocument, *, operational: bool = True) -> int:
     """Bits of 6041h that show why a drive without torque cannot be enabled.
 
     Args:
-        profile: Of the drive.
         operational: It is certainly in the NMT state *operational*; many makes clear bit 9
             (remote) in the others.
     """
@@ -128,7 +127,6 @@ def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -
     the search.
 
     Args:
-        profile: Of the drive.
         is_there: Called with the communication parameters of each; returns whether it exists.
     """
     for indices, first in zip(unused_pdos(profile), _FIRST_PDOS, strict=True):
@@ -143,8 +141,6 @@ def unwatched_peers(
     """One remark for all drives that lack the same number of heartbeat entries.
 
     Args:
-        profile: Of the drives.
-        nodes: The drives.
         entries: Number of producers that each can monitor.
     """
     if not profile.watches_heartbeats:
@@ -258,9 +254,6 @@ def how_without(
     """The next step for a required object that is missing.
 
     Args:
-        profile: Of the drive.
-        index: Of the object.
-        sub: Of the object.
         read: Reads an optional object of the drive by index, sub-index and name.
     """
     if index == SUPPORTED_MODES:

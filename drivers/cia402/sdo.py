@@ -98,9 +98,7 @@ class SetupNetwork:
         """Takes an open bus and sends nothing yet.
 
         Args:
-            bus: The bus.
             pump: As for `drivers.factory.make_drive_group`.
-            nodes: The drives.
             timeout: Of one request, [s].
             clock: Monotonic, [s].
         """
@@ -238,7 +236,6 @@ class Client:
     """SDO client of one drive, with one request at a time."""
 
     def __init__(self, node: int, network: SetupNetwork) -> None:
-        """Takes the node and its network."""
         self.node = node
         self._network = network
         self._wanted: Key | None = None
@@ -299,9 +296,6 @@ class Client:
         """Reads an object.
 
         Args:
-            index: Index.
-            sub: Sub-index.
-            name: For messages.
             size: Size of the value if the answer does not state it, [bytes].
 
         Raises:
@@ -365,12 +359,7 @@ class Client:
         self._network.send(SDO_REQUEST_BASE + self.node, request)
 
     def _exchange(self, request: bytes, wanted: Key) -> bytes:
-        """Sends one request and returns its answer.
-
-        Raises:
-            _Aborted: The drive aborted the transfer.
-            _NoAnswer: It did not answer in time.
-        """
+        """Sends one request and returns its answer."""
         self._ask(request, wanted)
         deadline = self._network.clock() + self._network.timeout
         while self._answer is None:

@@ -232,7 +232,6 @@ class StateReading(SdoJobs):
         """Sends nothing yet.
 
         Args:
-            nodes: Of all drives.
             again_after: As for `SdoJobs`.
             answer: Turns until an answer at most, from `answer_cycles`.
             silent: Nodes that missed the last cycle; lost without any answer in this time.
@@ -320,7 +319,6 @@ class ModeCheck:
         """Sends nothing yet.
 
         Args:
-            nodes: Of all drives.
             cycles: Largest number of cycles.
             again_after: As for `SdoJobs`.
         """

@@ -130,10 +130,8 @@ def late_drives(
     Drives that only wait for these are not among them.
 
     Args:
-        names: By node id.
         status_words: Of each of them, as last reported.
         commanded: Last control word of each of them.
-        goal: ENABLE or RELEASE.
         seconds: Time that they had, [s].
         bits: As for `without_power`.
     """
@@ -178,7 +176,6 @@ def stopped_between_replies(
     """Enabled drives that were not so between two replies, by node; faults have their own message.
 
     Args:
-        names: By node id.
         status_words: Read between replies, by node; not of all.
     """
     states = ((node, state_of(word)) for node, word in status_words.items())
@@ -204,7 +201,6 @@ def without_power(status_word: int, bits: int) -> list[str]:
     """Likely reasons why a drive at rest cannot be enabled; none for others.
 
     Args:
-        status_word: As last reported.
         bits: Those of `POWER_BITS` that have this meaning.
     """
     if state_of(status_word) not in WITHOUT_TORQUE:
@@ -233,7 +229,6 @@ def change_on_its_own(
     passing, between two replies, looks like one that has not followed it yet: it is late.
 
     Args:
-        goal: Of the group.
         enables: "Enable operation" was sent for this goal. Before that a drive is only commanded to
             hold, or one without torque to approach SWITCHED ON; from then on all have the same
             command.
@@ -307,8 +302,6 @@ def next_words(
     """The control words of the next cycle, one per drive.
 
     Args:
-        goal: Of the group.
-        states: As last reported.
         stop_commanded: True for drives that were sent a quick stop since they reported QUICK STOP
             ACTIVE.
         kept: Words of `SentWords.kept`, by index. None of these drives is enabled, nor are others
@@ -419,9 +412,6 @@ class SentWords:
         Each of them showed a state without torque, and was not sent "enable operation" since. Many
         drives pass through codes outside the standard while they change their state: another word
         would take them back. A stop leads nowhere and is not kept.
-
-        Args:
-            states: As last reported.
         """
         rows = enumerate(zip(states, self.words, self._at_rest, strict=True))
         return {

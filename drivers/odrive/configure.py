@@ -242,11 +242,7 @@ def check_resolution(rig: Rig) -> None:
 
 
 def _check_speeds(rig: Rig, layouts: Layouts) -> None:
-    """Requires that feed-forward, 16 bits, holds the top speed of every winch.
-
-    Raises:
-        BadInput: It does not.
-    """
+    """Requires that feed-forward, 16 bits, holds the top speed of every winch."""
     _, step, _ = layouts.set_input_pos.scales
     most = LARGEST_STEPS * (step or 1.0)
     for drive, winch in enumerate(rig.winches):
@@ -262,11 +258,7 @@ def _check_speeds(rig: Rig, layouts: Layouts) -> None:
 
 
 def _check_periods(rig: Rig, document: OdriveDocument) -> None:
-    """Requires positions and torques often enough for the monitors.
-
-    Raises:
-        BadInput: They are too rare.
-    """
+    """Requires positions and torques often enough for the monitors."""
     limit = MOST_CYCLES * rig.document.bus.cycle_ms
     for key, setting in (("estimates_ms", "encoder"), ("torques_ms", "torques")):
         period = getattr(document, key)
@@ -293,17 +285,10 @@ def _answers(
     """One message from every drive.
 
     Args:
-        link: The bus.
-        layout: Of the message.
-        nodes: The drives.
         timeout: Time for all of them, [s].
         asked: The message was requested; otherwise drives send it on their own.
         once: No drive may send it twice.
         alive: Message that shows which silent drives are there, and the time to wait for it, [s].
-
-    Raises:
-        HardwareMissing: A drive sent none.
-        Refused: A drive sent two.
     """
     received: Answers = {}
     for node, values in link.answers(layout, timeout):
@@ -395,11 +380,7 @@ def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> No
 def _check_rates(
     link: SetupLink, layouts: Layouts, nodes: Sequence[int], document: OdriveDocument
 ) -> None:
-    """Checks that positions and torques are as frequent as in the rig file.
-
-    Raises:
-        HardwareMissing: They are rarer.
-    """
+    """Checks that positions and torques are as frequent as in the rig file."""
     for key, setting, layout in (
         ("estimates_ms", "encoder_msg_rate_ms", layouts.get_encoder_estimates),
         ("torques_ms", "torques_msg_rate_ms", layouts.get_torques),
@@ -415,12 +396,7 @@ def _check_rates(
 
 
 def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wanted: Wanted) -> None:
-    """Writes a setting and reads it back.
-
-    Raises:
-        HardwareMissing: The drive does not report it.
-        Refused: It reports another value.
-    """
+    """Writes a setting and reads it back."""
     raw = endpoint.to_raw(wanted.value)
     link.write(node, endpoint.number, raw, endpoint.size)
     # Since firmware 0.6.11 writes are confirmed; the confirmation must not be taken for the answer.

@@ -214,11 +214,7 @@ class OdriveMonitor:
         return AxisState.CLOSED_LOOP_CONTROL in self.states
 
     def take_expired(self, drives: Container[int]) -> list[int]:
-        """Those of the drives whose only error is their watchdog; forgets it until reported again.
-
-        Args:
-            drives: By index.
-        """
+        """The drives whose only error is their watchdog; forgets it until reported again."""
         expired = [
             drive
             for drive, errors in enumerate(self.errors)
@@ -349,7 +345,6 @@ def too_rare(
     """Refusal of drives that sent a message less often than in the rig file; None if none did.
 
     Args:
-        nodes: The drives.
         heard: Messages of each while it should have sent `LISTENED`, by node.
         key: Of the period in the rig file.
         setting: Of the period in the drive.

@@ -30,7 +30,6 @@ class CameraHealth:
     """Judges a camera by its requests and answers."""
 
     def __init__(self) -> None:
-        """Starts without requests."""
         self._asked: float | None = None
         self._blind = 0
 
@@ -337,7 +336,6 @@ def samples_at_rest(
 
     Args:
         process: Of the camera, which is open.
-        pictures: Number of images.
         period: Of images in simulated time, [s]; None for a real camera.
         true_pose: Of the simulated platform.
         check_stop: Called before each image and while waiting; an exception ends it.

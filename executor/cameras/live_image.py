@@ -109,7 +109,6 @@ class ImageReader:
         """Opens the memory of a process.
 
         Args:
-            process: Its ID.
             descriptor: Of the memory there; see ``live_image`` in `executor.remote.status`.
 
         Raises:

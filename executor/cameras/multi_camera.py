@@ -88,8 +88,6 @@ class MultiCameraMonitor:
         """Starts without samples.
 
         Args:
-            names: Of the cameras.
-            model: Robot and obstacles.
             limit: Clearance required by the scene, [m].
             rate: Frame rate, [Hz].
         """
@@ -206,7 +204,6 @@ class RunCameras:
 
         Args:
             clients: One or more cameras.
-            model: Robot and obstacles.
             limit: Clearance required by the scene, [m].
             rate: Frame rate, [Hz].
         """
@@ -380,7 +377,6 @@ class CameraWatch:
         """Starts without requests.
 
         Args:
-            cameras: Of the run.
             status: Updated with their state.
             board: Takes the stop request.
             report: Called with each event.

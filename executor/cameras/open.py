@@ -58,7 +58,6 @@ def open_cameras(
     """Starts a process for each camera; None without one.
 
     Args:
-        prepared: The run.
         sources: From `resolve_cameras`.
         folder: The run folder, which keeps about `KEPT_IMAGES` of each camera's images.
         board: A stop request ends the opening.
@@ -112,9 +111,7 @@ def report_unmeasured_rotation(rig: Rig, rotations: Array, listener: Listener) -
     """Remarks on a plan that rotates the platform farther than cameras measure it.
 
     Args:
-        rig: The robot.
         rotations: ``world_from_platform`` along the plan, shape (n, 3, 3).
-        listener: Receives the remark.
     """
     cosine = (np.einsum("nij,ij->n", rotations, rig.home.rotation).min() - 1.0) / 2.0
     angle, limit = np.degrees([np.arccos(np.clip(cosine, -1.0, 1.0)), MOST_TURN])
@@ -214,7 +211,6 @@ class LiveImages:
     """A real camera as a source of images."""
 
     def __init__(self, camera: LiveCamera) -> None:
-        """Uses an open camera."""
         self._camera = camera
 
     def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
@@ -238,9 +234,7 @@ def measure_at_rest(
     """Opens a camera, takes images of a platform at rest and measures each.
 
     Args:
-        rig: The robot.
         camera_source: From `choose_one_camera`.
-        pictures: Number of images.
         true_pose: Of the simulated platform.
         check_stop: Called repeatedly; an exception ends it.
         listener: Receives the opening of the camera.

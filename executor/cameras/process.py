@@ -79,11 +79,9 @@ class ImageSource(Protocol):
 
     def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """A grey image, and the middle of its exposure after the request, [s]."""
-        ...
 
     def close(self) -> None:
         """Closes the camera."""
-        ...
 
 
 _NOTHING: tuple[int, NDArray[np.uint8], Observation] = (
@@ -113,8 +111,6 @@ class CameraWorker:
 
         Args:
             rig: The robot with its tags.
-            camera: The camera.
-            source: Of its images.
             folder: For kept images; None to keep none.
             keep_every: First interval of kept images, in frames; it doubles after every
                 `KEPT_IMAGES`, so that a run on hold for hours does not fill the disk.
@@ -191,7 +187,6 @@ class CameraProcess:
         """Starts the process; see `is_ready`.
 
         Args:
-            name: Of the camera.
             make_worker: Called in the process; picklable.
             may_wait: Wait for answers, in simulated time, so that runs are reproducible.
         """

@@ -87,7 +87,6 @@ def choose_cameras(
         rig: The robot with its cameras.
         wanted: One source, or ``NAME=SOURCE`` for each of several cameras; ``synthetic`` or an
             empty list selects all cameras.
-        without: No camera.
         in_process: The drives are simulated in this process.
 
     Raises:
@@ -112,7 +111,6 @@ def resolve_cameras(rig: Rig, wanted: CameraChoice, in_process: bool) -> dict[Ca
     """The cameras of a run, from the argument of a library call.
 
     Args:
-        rig: Its cameras.
         wanted: See `CameraChoice`.
         in_process: The drives are simulated in this process.
 
@@ -146,7 +144,6 @@ def choose_one_camera(rig: Rig, wanted: list[str], in_process: bool) -> tuple[Ca
     """The single camera that measures a platform at rest, and its image source.
 
     Args:
-        rig: Its cameras.
         wanted: One source, or ``NAME=SOURCE``.
         in_process: The drives are simulated in this process.
 
@@ -210,7 +207,6 @@ def parse_named_source(rig: Rig, source: str, where: str) -> tuple[Camera, str]:
 
     Args:
         rig: The robot with its cameras.
-        source: The text.
         where: Its origin, for messages.
 
     Raises:
@@ -356,7 +352,6 @@ def report_different_videos(videos: Mapping[str, tuple[int, float]], listener: L
 
     Args:
         videos: Number of images, and rate [Hz], of that of each camera.
-        listener: Receives the remark.
     """
     if len({(count, round(rate, 3)) for count, rate in videos.values()}) > 1:
         facts = ", ".join(f"{n} {count} at {rate:.6g}/s" for n, (count, rate) in videos.items())

@@ -51,7 +51,6 @@ class Loop:
         Args:
             checked: The checked set-points, with the rig they are for.
             master: Sends the cycles of configured drives.
-            calls: To the supervisor.
         """
         self.machine = Machine()
         self._checked, self._rig, self._master = checked, checked.rig, master

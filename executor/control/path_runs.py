@@ -136,10 +136,6 @@ def run_in_process(
     """Moves along the path in simulated time; ends with the drives holding on their own.
 
     Args:
-        prepared: The checked run.
-        group: Configured drives.
-        clock: Simulated time.
-        board: Operator requests.
         recorder: Records cycles and events.
         true_pose: Returns the true pose of the simulated platform.
         carry: Changes the payload of the simulated platform.
@@ -188,9 +184,7 @@ def run_in_real_time(
     """Moves along the path in the real-time process; ends with the drives holding.
 
     Args:
-        prepared: The checked run.
         make_drives: Opens and configures the drives; called in that process; picklable.
-        board: Operator requests.
         recorder: Records cycles and events.
         pose_every: Cycles between true poses of the simulated platform; 0 for none.
         need_real_time: Refuse to arm when the system denies real-time scheduling.

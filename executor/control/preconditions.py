@@ -84,7 +84,6 @@ def require_at_start(checked: CheckedSetpoints, actual: Array) -> None:
     """Requires the drives to be at the first set-points.
 
     Args:
-        checked: The set-points.
         actual: Positions of the drives, shape (m,), [counts].
 
     Raises:
@@ -121,7 +120,6 @@ def require_still_referenced(
     hold it.
 
     Args:
-        rig: The robot.
         reference: Homing reference of its drives; None where it needs none.
         restarted: Nodes found without this program's configuration.
         seen: State of the drives before any is enabled.
@@ -172,7 +170,6 @@ def with_counts_at(rig: Rig, counts: Sequence[int], pose: Pose) -> Rig:
     """The rig that unreferenced drives are configured for, with counts from a guessed pose.
 
     Args:
-        rig: The robot.
         counts: Positions of its drives, [counts].
         pose: Approximate pose of its platform, ``world_from_platform``.
 
@@ -195,7 +192,6 @@ def configuration_at_rest(rig: Rig, snapshot: DriveSnapshot) -> tuple[Rig, float
     The rig file's counts do not apply: a drive enabled beyond its position limits runs to them.
 
     Args:
-        rig: The robot.
         snapshot: Positions of its drives.
 
     Returns:
@@ -210,7 +206,6 @@ def with_reduced_limits(rig: Rig, *, limit: float, speed: float) -> Rig:
     With the platform on a jig or detached, no tensions need balance it.
 
     Args:
-        rig: The robot.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
     """
@@ -229,7 +224,6 @@ def require_below(rig: Rig, held: DriveSnapshot, limit: float) -> None:
     The load on closed brakes is unknown until the drives are enabled.
 
     Args:
-        rig: The robot.
         held: State of its drives.
         limit: Largest tension, [N].
 

@@ -303,7 +303,6 @@ def release_drives(
     """Switches off the torque, and updates latch and reference.
 
     Args:
-        rig: The robot.
         interlock: Of that rig.
         process: For `Release`.
         on_armed: Called when armed, with what the system denied.
@@ -368,7 +367,6 @@ def reset_drives(interlock: MotionInterlock, process: RealTimeProcess) -> Drives
     present positions; so does that of absolute encoders which lost no turns.
 
     Args:
-        interlock: Of their rig.
         process: For `FaultReset`.
 
     Raises:

@@ -85,7 +85,6 @@ class SyncMaster:
     """
 
     def __init__(self, rig: Rig, group: DriveGroup, clock: Clock) -> None:
-        """Takes configured drives; sends nothing yet."""
         self.group, self.clock = group, clock
         timeout = group.capabilities.sync_timeout
         self.rule = SyncAge(USUAL_TIMEOUT if timeout is None else timeout)
@@ -281,7 +280,6 @@ def changed_states(
     """Names the drives that are enabled or changed their state at the end; empty if none did.
 
     Args:
-        rig: The robot.
         before: Status before monitoring was ended.
         after: Status after the last SYNC.
         excluded: Drives, from 0, whose state is already reported: only named while still enabled.
@@ -315,7 +313,6 @@ def lost_states(
     They are still enabled, hold no longer, or do not answer.
 
     Args:
-        rig: The robot.
         before: As for `changed_states`.
         after: As for `changed_states`.
         held: Nodes of the drives that have held their cables at some time.
@@ -361,7 +358,6 @@ def hold_timeout_text(
     """States that drives did not hold within a time: which, and which replies are missing.
 
     Args:
-        rig: The robot.
         status: Of the last cycle.
         within: The time, [s].
         was_enabled: Of all drives; otherwise each that follows no set-points has stopped.

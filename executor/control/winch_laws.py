@@ -84,7 +84,6 @@ class TensionReserve:
         """A reserve at the start of a jog.
 
         Args:
-            rig: The robot.
             cable: Index, from 0.
             limit: Largest tension of any cable, [N].
             pays_out: Whether the cable is paid out, otherwise wound in.
@@ -139,17 +138,14 @@ class WinchLaw(Protocol):
     @property
     def reach(self) -> tuple[Targets, Targets]:
         """First and farthest targets, [counts]."""
-        ...
 
     @property
     def done(self) -> bool:
         """Whether the law has finished."""
-        ...
 
     @property
     def progress(self) -> float:
         """Share done, from 0 to 1."""
-        ...
 
     def next(self, pace: float, tensions: Sequence[float]) -> tuple[Targets, tuple[Alarm, ...]]:
         """Computes the next cycle.
@@ -161,7 +157,6 @@ class WinchLaw(Protocol):
         Returns:
             Targets of all winches, [counts], and alarms that end the motion.
         """
-        ...
 
 
 class PretensionLaw:
@@ -174,7 +169,6 @@ class PretensionLaw:
         """Prepares the law.
 
         Args:
-            rig: The robot.
             begin: Positions of the drives, [counts].
             targets: Tension at which each cable is taut, shape (m,), [N].
             limit: Largest tension of any cable, [N].
@@ -256,7 +250,6 @@ class OneCableLaw:
         """Prepares the law.
 
         Args:
-            rig: The robot.
             begin: Positions of the drives, [counts].
             cable: Index, from 0.
             length: Largest length to pay out, [m]; negative to wind in.

@@ -87,15 +87,12 @@ class WinchMover(Protocol):
         Raises:
             CdprError: Arming failed; nothing was enabled.
         """
-        ...
 
     def run(self) -> Ended:
         """Moves; the drives hold on their own at the end."""
-        ...
 
     def read_status(self) -> CycleStatus:
         """Status of the drives after the motion."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,11 +118,7 @@ class LawMotion(MotionTask):
 
 
 def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:
-    """Requires that no drive would have to move beyond where the workspace can need it.
-
-    Raises:
-        Refused: A drive with position limits would stop at them, or take them as a fault.
-    """
+    """Requires that no drive would have to move beyond where the workspace can need it."""
     winches = WinchMap(rig)
     for drive, (first, farthest) in enumerate(zip(*law.reach, strict=True)):
         low, high = position_limits(rig, drive, winches)
@@ -151,7 +144,6 @@ class WinchesHere:
     def __init__(
         self, motion: MotionTask, drives: ReadyDrives, clock: Clock, board: RequestBoard
     ) -> None:
-        """Sends nothing yet."""
         self._motion, self._drives, self._board = motion, drives, board
         self._master = SyncMaster(drives.rig, drives.group, clock)
         self._loop: Procedure | None = None

@@ -67,8 +67,6 @@ def require_held(rig: Rig, result: WinchResult, found: CycleStatus) -> None:
     """Requires the drives to hold at the positions where the motion ended.
 
     Args:
-        rig: The robot.
-        result: Of the motion.
         found: Present status of the drives.
 
     Raises:

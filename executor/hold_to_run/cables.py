@@ -63,9 +63,7 @@ class CableLimits:
         """Travel that a press may move its cable from here, [m]; negative winds in.
 
         Args:
-            rig: The robot.
             here: Positions of the drives, [counts].
-            held: The press.
         """
         cable, sign = held.cable - 1, 1.0 if held.pays_out else -1.0
         per_metre = rig.winches[cable].counts_per_metre
@@ -228,7 +226,6 @@ class CableTravel:
         """Starts without motion.
 
         Args:
-            rig: The robot.
             limit: Largest tension, [N].
             longest: Largest travel of one press, [m].
         """

@@ -40,7 +40,6 @@ class JogLine:
 
         Args:
             rig: The robot; its motion has the jog speed.
-            scene: Obstacles and load.
             start: Pose of the platform at rest, ``world_from_platform``.
             direction: Unit vector in the world frame, shape (3,).
         """

@@ -93,11 +93,7 @@ class JogLoop(Loop):
         return self._feed.index + self._feed.rows_to_rest + MARGIN < len(self._rows) - 1
 
     def _take(self, piece: Piece, share: float) -> None:
-        """Begins a line at the platform's rest position, or extends the present one.
-
-        Raises:
-            Fault: The rows are not those that were checked.
-        """
+        """Begins a line at the platform's rest position, or extends the present one."""
         if not piece.is_unchanged(self._checked.cycle):
             raise Fault(
                 "the set-points of a jog differ from those that were checked",

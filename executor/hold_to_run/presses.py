@@ -38,7 +38,6 @@ class PressRule:
     """Distinguishes held presses from ended ones; a clock that jumps back also ends one."""
 
     def __init__(self) -> None:
-        """Starts without a press."""
         self._over = 0
 
     def held(self, number: int, heard: float, now: float) -> bool:
@@ -152,7 +151,6 @@ class PressBoard:
         """Reports a held control that moves the platform; returns False if that press is over.
 
         Args:
-            number: Of the press.
             direction: Unit vector, shape (3,); taken at the beginning of a press.
             in_platform: See `PlatformPress`.
             step: See `Press`, [m].
@@ -184,7 +182,6 @@ class PressBoard:
         """Reports a held control that moves one winch; returns False if that press is over.
 
         Args:
-            number: Of the press.
             cable: Its number, from 1; taken at the beginning of a press, like the next two.
             pays_out: See `CablePress`.
             step: See `Press`, [m].

@@ -76,7 +76,6 @@ def jog_session(
         start: Pose of the simulated platform, ``world_from_platform``; None for its home pose.
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives events.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
         on_cycle: Called after every cycle with the board of presses and the checked line, for
@@ -136,7 +135,6 @@ def cable_session(
         speed: Largest winch speed, [m/s].
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives events.
         confirm: Called once, before anything is enabled; False cancels it.
         supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
         on_cycle: Called after every cycle with the board of presses and the cable travel, for
@@ -264,7 +262,6 @@ def _run(
         cables: See `PressBoard`.
         realtime: As for `jog_session`, like all that follow.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
-        listener: Receives events.
         on_cycle: Called after every cycle.
     """
     clock = SimulatedClock(rig.cycle)

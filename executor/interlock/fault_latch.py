@@ -79,7 +79,6 @@ class FaultLatch:
         """Reads nothing yet.
 
         Args:
-            settings: Of the bus.
             nodes: Node IDs of the rig's drives, to engage or reset it.
         """
         self._bus, self._nodes = str(settings), tuple(nodes)
@@ -164,7 +163,6 @@ class FaultLatch:
         If the block is refused, the latch stays as it was; if it fails, the latch is engaged.
 
         Args:
-            rig: Name of the rig.
             shown: The fault that the operator confirmed.
 
         Raises:
@@ -226,9 +224,7 @@ class FaultLatch:
         """Engages the latch before a run; it stays if the run does not finish.
 
         Args:
-            rig: Name of the rig.
             folder: Record of the run.
-            cause: Reported then.
 
         Raises:
             Refused: It is already engaged, or cannot be written.
@@ -274,9 +270,6 @@ class FaultLatch:
 
         Args:
             state: `_DURING_FAULT` if a fault is latched.
-
-        Raises:
-            Refused: Another program moves or resets the drives, or the lock cannot be made.
         """
         if self._held is not None:
             return

@@ -38,7 +38,6 @@ class MotionInterlock:
     """Motion interlock of the bus of one rig."""
 
     def __init__(self, rig: Rig) -> None:
-        """Reads nothing yet."""
         self._rig = rig
         settings = BusSettings.of(rig)
         self._is_kept = settings.interface != IN_PROCESS
@@ -302,7 +301,6 @@ class MotionInterlock:
         """Ends a motion: frees the bus if it ended well, else latches the fault.
 
         Args:
-            state: Final state.
             cause: Why it did not end well.
             record: Path of its record.
             holding: Every cable was held to the end.
@@ -430,7 +428,6 @@ def reference_status(
     """The reference of a bus.
 
     Args:
-        interlock: Of the bus.
         positions: Of its drives, [counts]; None if not read.
         held: All drives hold on their own, none without its configuration, so that a reset stores
             their positions.

@@ -156,7 +156,6 @@ def open_lock(path: Path, *, create: bool = False) -> int:
     It is opened for writing where that is allowed, as network file systems require it.
 
     Args:
-        path: The file.
         create: Create an empty file if there is none.
 
     Raises:
@@ -179,7 +178,6 @@ def open_state_file(path: Path, access: int = os.O_RDONLY) -> int:
     a FIFO that blocks forever. Links are not followed, and FIFOs do not block.
 
     Args:
-        path: The file.
         access: Flags of `os.open`.
 
     Raises:
@@ -281,7 +279,6 @@ class SetUpLock:
     """Lock for configuring the drives of one bus."""
 
     def __init__(self, settings: BusSettings) -> None:
-        """Opens nothing yet."""
         self._bus, self._is_shared = str(settings), settings.interface != IN_PROCESS
         self._path = state_file("set-up", settings).with_suffix(".lock")
 

@@ -123,8 +123,6 @@ def moved_since(rig: Rig, reference: HomingReference, positions: Sequence[int]) 
     Zero for absolute encoders, which keep counting when moved.
 
     Args:
-        rig: The robot.
-        reference: Of its drives.
         positions: Of the drives now, [counts].
     """
     rows = zip(rig.winches, positions, reference.stands_at, strict=True)
@@ -138,8 +136,6 @@ def why_moved(rig: Rig, reference: HomingReference, positions: Sequence[int]) ->
     """Which drive moved farthest since the last motion, and by how much; empty within tolerance.
 
     Args:
-        rig: The robot.
-        reference: Of its drives.
         positions: Of the drives now, [counts].
     """
     moved = moved_since(rig, reference, positions)
@@ -168,7 +164,6 @@ def why_turns_lost(rig: Rig, reference: HomingReference, positions: Sequence[int
     a brake a drum may be at any angle.
 
     Args:
-        rig: The robot.
         reference: Of its drives; they were not moved by a program since `stands_at`.
         positions: Of the drives now, [counts].
     """
@@ -205,8 +200,6 @@ def released_since(
     Absolute encoders may be power-cycled.
 
     Args:
-        rig: The robot.
-        reference: Of its drives.
         restarted: Nodes found without this program's configuration.
         released: Nodes found without torque.
     """
@@ -224,7 +217,6 @@ class ReferenceFile:
     """The reference file of one bus, also where it was before a folder for all users existed."""
 
     def __init__(self, settings: BusSettings) -> None:
-        """Reads nothing yet."""
         self._paths = state_files("reference", settings)
 
     @property

@@ -81,7 +81,6 @@ class Procedure(Protocol):
     @property
     def positions(self) -> tuple[int, ...]:
         """Last reported positions of the drives, from arming on, [counts]."""
-        ...
 
     def arm(self, require: Callable[[CycleStatus], None]) -> None:
         """Arms the drives; see `executor.control.loop.Loop.arm`.
@@ -89,11 +88,9 @@ class Procedure(Protocol):
         Raises:
             CdprError: Arming failed; nothing was enabled.
         """
-        ...
 
     def run(self) -> State:
         """Runs to the end, where the drives hold on their own, or are released."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,11 +133,9 @@ class Records(Protocol):
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
         """Takes a cycle, and the simulated platform's true pose if known."""
-        ...
 
     def take_event(self, event: LoopEvent) -> None:
         """Takes an event."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -258,13 +253,7 @@ _TERMINAL_SIGNALS = (
 
 
 def serve(job: Job, link: Connection, supervisor: int) -> None:
-    """Runs a job; always ends with the drives holding on their own.
-
-    Args:
-        job: The job.
-        link: To the supervisor.
-        supervisor: Its process ID.
-    """
+    """Runs a job; always ends with the drives holding on their own."""
     supervised = Supervised(job.board, supervisor)
     # The supervisor handles signals of the terminal, through the board; if it is suspended or
     # killed, its silence is detected.

@@ -57,9 +57,7 @@ def real_time_process(
     """A process for one motion; ends when the block is left.
 
     Args:
-        motion: The motion.
         make_drives: Opens and configures the drives; called in that process; picklable.
-        board: Operator requests.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
         check_drives: Reads the state of drives whose process is gone; returns what is wrong, empty
             if all hold but the nodes given, which were never enabled.
@@ -89,7 +87,6 @@ class RealTimeProcess:
     def __init__(
         self, job: Job, board: SharedRequests, check_drives: CheckDrives, listener: Listener
     ) -> None:
-        """Starts the process, which opens the drives."""
         self._board, self._check_drives, self._listener = board, check_drives, listener
         self._wire = CycleRecordCodec(job.motion.cables)
         self._cycles, self._events = Ring(job.cycles, CYCLE_SLOTS), Ring(job.events, EVENT_SLOTS)

@@ -25,7 +25,6 @@ class _Sent(Protocol):
 
     def detach(self) -> int:
         """Returns the file descriptor in this process."""
-        ...
 
 
 class SharedMemory:
@@ -163,7 +162,6 @@ class CycleRecordCodec:
     """
 
     def __init__(self, cables: int) -> None:
-        """A codec for this number of cables."""
         self._cables = cables
         self._layout = struct.Struct(f"<Qd B dd HQQ ddQ {4 * cables}i {cables}? 7d")
         self.size = self._layout.size
@@ -254,7 +252,6 @@ class SharedRequests:
     """The supervisor's side; a `RequestBoard`. Each request has its own byte."""
 
     def __init__(self) -> None:
-        """Starts without requests."""
         self.memory = SharedMemory.create(_SIZE)
         self.memory.view[_PERCENT] = 100
         self._beats = 0

@@ -75,11 +75,7 @@ class ClearanceTable(Table):
     planned_distances: Array
 
     def __post_init__(self) -> None:
-        """Refuses arrays of different sizes.
-
-        Raises:
-            ValueError: Naming the attribute.
-        """
+        """Refuses arrays of different sizes."""
         Table.__post_init__(self)
         rows, count = len(self.time), len(self.obstacles)
         for name in ("distances", "planned_distances"):
@@ -154,7 +150,6 @@ def tension_noise(rig: Rig, tensions: Array) -> Array:
     Changes by the platform's motion in a cycle count as noise as well: a torque may be a cycle old.
 
     Args:
-        rig: The robot.
         tensions: Of every cycle, shape (n, m), [N]; NaN where unknown.
 
     Returns:
@@ -175,8 +170,6 @@ def encoder_covariance(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) ->
     """Covariance of a pose that fits the cable lengths from the encoders.
 
     Args:
-        winches: Of the robot.
-        rig: The robot.
         pose: ``world_from_platform``.
         noise: See `tension_noise`, shape (m,), [N].
 
@@ -240,8 +233,6 @@ def encoder_rows(model: ClearanceModel, cycles: CycleTable, required: float) -> 
     or below the required one, rows in the middle are added until that motion is at most `STEP`.
 
     Args:
-        model: Robot and scene.
-        cycles: Of the run.
         required: Clearance to the obstacles, [m].
     """
     known = np.flatnonzero(cycles.has_encoder_pose)
@@ -292,8 +283,6 @@ def _motion(rig: Rig, cycles: CycleTable, known: NDArray[np.int64]) -> Array:
     """Upper bound of the path length of every point of the platform up to each encoder pose.
 
     Args:
-        rig: The robot.
-        cycles: Of the run.
         known: Cycles with an encoder pose, shape (n,).
 
     Returns:

@@ -108,11 +108,7 @@ def write_mcap(
 
     Args:
         folder: Run folder; its images are included, as far as they exist.
-        context: Of the run.
-        cycles: All cycles.
         poses: Pose of every image, or why there is none.
-        clearance: All rows.
-        fused: All rows.
         alone: Poses of each of several cameras, by name; empty for a single camera.
 
     Raises:
@@ -140,7 +136,6 @@ def write_messages(
     """Writes messages in order of time, atomically.
 
     Args:
-        path: The file.
         messages: Of the channels in `executor.recording.mcap_channels`, or of one of them for a
             single camera (`executor.recording.mcap_channels.topic_of`).
         start: Origin of their times, [ns since 1970].
@@ -257,7 +252,6 @@ def write_track_mcap(
     """Writes ``/tag_pose``, ``/tag_status`` and ``/clearance``, also for each of several cameras.
 
     Args:
-        path: The file.
         pictures: Measurements; their times count from ``start``.
         alone: Measurements of each of several cameras, by name; empty for a single camera.
         start: [ns since 1970].

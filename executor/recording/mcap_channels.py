@@ -189,7 +189,6 @@ def poses_of(
     """A message per known pose.
 
     Args:
-        topic: Of the messages.
         times: Since the start of the run, shape (n,), [s].
         positions: Shape (n, 3), [m].
         quaternions: (w, x, y, z), shape (n, 4).

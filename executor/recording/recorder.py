@@ -157,7 +157,6 @@ class RunLog:
         cables in ways that no pose has.
 
         Args:
-            cycles: n cycles.
             rows: Table rows of the set-points sent, shape (n,).
         """
         tensions, known = self._rig.tensions_by(cycles["torques"]), cycles["tension_known"]
@@ -370,11 +369,9 @@ class Recorder:
         """Starts without cycles and events.
 
         Args:
-            prepared: The run.
             folder: Takes cycles and events as they happen.
             status: Updated with cycles and events.
             trigger: Called for every image.
-            every: Cycles between images.
             progress: Called regularly with the number of completed rows.
             announce: Called with a sentence when a stop is reached and left.
             on_event: Called with each event, after it is recorded.
@@ -405,7 +402,6 @@ class Recorder:
         """Records a cycle.
 
         Args:
-            record: Of the cycle.
             true_pose: Of the simulated platform, in cycles with an image.
 
         Raises:

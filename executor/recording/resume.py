@@ -50,7 +50,6 @@ class RunEnd:
         """Human-readable start of a plan that continues the run.
 
         Args:
-            folder: Of the run.
             done: Number of the scene's visited stops.
             left: Number of remaining stops.
         """
@@ -195,11 +194,7 @@ def _is_there(scene: Scene) -> bool:
 
 
 def _require_room(scene: Scene, rig: Rig) -> None:
-    """Requires enough clearance at the start for a plan.
-
-    Raises:
-        BadInput: The clearance is too small; with the one to request.
-    """
+    """Requires enough clearance at the start for a plan."""
     model = ClearanceModel(rig, scene)
     near, own = model.smallest(scene.start), model.self_clearance(scene.start)
     pairs = [(own, scene.self_clearance, "set clearance.self_mm in the scene to {0:g}")]

@@ -107,10 +107,7 @@ def judge(
     """The verdict on a run.
 
     Args:
-        context: Of the run.
-        cycles: Of the drives.
         poses: Fused poses of the cameras.
-        clearance: Distances to obstacles.
     """
     course, rig, scene = context.course, context.rig, context.plan.scene
     final_state, began = course.final_state, cycles.path_began

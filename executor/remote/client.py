@@ -63,7 +63,6 @@ class RunLink:
     """
 
     def __init__(self, run: RunConnection) -> None:
-        """Starts without requests."""
         self._run, self._begun = run, b""
         self.owed = 0
 

@@ -52,7 +52,6 @@ def serving(
 
     Args:
         listeners: Listening sockets, which the caller closes.
-        board: Takes operator requests.
         status: Reported in answers.
         presses: Of a jog session; None for any other motion.
         on_early_stop: Of a motion that is still being prepared: called after each stop, until
@@ -100,7 +99,6 @@ class CommandServer:
         board: RequestBoard,
         answers: _Answers,
     ) -> None:
-        """Serves nothing yet."""
         self._board, self._woken, self._answers = board, woken, answers
         self._selector = selectors.DefaultSelector()
         self._selector.register(woken, selectors.EVENT_READ)

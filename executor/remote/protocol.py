@@ -130,7 +130,6 @@ class StatusSource(Protocol):
 
     def as_dict(self) -> dict[str, Any]:
         """See `executor.remote.status`."""
-        ...
 
 
 def answer_to(
@@ -146,8 +145,6 @@ def answer_to(
     A command takes effect even if the run then cannot report its status.
 
     Args:
-        line: The request.
-        board: Takes operator requests.
         status: Reported in the answer.
         presses: Of a jog session; None for any other motion.
         ahead: The motion is still being prepared, and takes only a stop.

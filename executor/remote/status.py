@@ -62,7 +62,6 @@ class CyclesSoFar:
     """Status from cycle records, for any kind of motion."""
 
     def __init__(self, rig: Rig, *, simulated_time: bool) -> None:
-        """Starts without cycles."""
         self.began = 0.0
         """Time of the first cycle, [s]."""
         self.last: CycleRecord | None = None
@@ -196,7 +195,6 @@ class MotionStatus(ABC):
     """Collects events; answers requests for status, from any thread."""
 
     def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
-        """A motion in preparation."""
         self._rig, self._board = rig, board
         self._cycles = CyclesSoFar(rig, simulated_time=simulated_time)
         self._cameras: list[dict[str, Any]] = []
@@ -246,7 +244,6 @@ class RunStatus(MotionStatus):
     def __init__(
         self, prepared: PreparedRun, folder: Path, board: RequestBoard, *, simulated_time: bool
     ) -> None:
-        """A run in preparation."""
         super().__init__(prepared.rig, board, simulated_time=simulated_time)
         self.take_folder(folder)
         self._prepared = prepared
@@ -305,7 +302,6 @@ class WinchStatus(MotionStatus):
     """Status of winches that move without a path."""
 
     def __init__(self, rig: Rig, board: RequestBoard, *, simulated_time: bool) -> None:
-        """A motion in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
         self._events: deque[LoopEvent] = deque(maxlen=EVENTS_SHOWN)
 
@@ -346,7 +342,6 @@ class JogStatus(SessionStatus):
     def __init__(
         self, rig: Rig, board: RequestBoard, progress: JogProver, *, simulated_time: bool
     ) -> None:
-        """A session in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
         self._jog = progress
 
@@ -368,7 +363,6 @@ class CableStatus(SessionStatus):
     def __init__(
         self, rig: Rig, board: RequestBoard, progress: CableTravel, *, simulated_time: bool
     ) -> None:
-        """A session in preparation."""
         super().__init__(rig, board, simulated_time=simulated_time)
         self._moved = progress
 

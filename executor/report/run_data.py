@@ -75,7 +75,6 @@ def missing_images(folder: RunFolder, tables: Iterable[PoseTable]) -> str:
     """States how many images are missing of those that the run kept; empty for none.
 
     Args:
-        folder: Of the run.
         tables: Its poses, and those of each of several cameras.
     """
     kept = {name for table in tables for name in table.picture if name}

@@ -151,7 +151,6 @@ class AlarmHistory:
     """
 
     def __init__(self) -> None:
-        """Starts without alarms."""
         self._seen: dict[tuple[str, str], tuple[int, int]] = {}  # its last cycle, its events
 
     def new_text(self, alarm: Alarm, cycle: int) -> str:
@@ -180,7 +179,6 @@ def shared_causes(alarms: Sequence[Alarm], names: Sequence[str]) -> tuple[Alarm,
     """The alarms of a cycle, with missing replies of several drives merged into one.
 
     Args:
-        alarms: Of one cycle.
         names: Of all drives, as the alarms name them.
     """
     merged: list[Alarm] = []
@@ -199,7 +197,6 @@ def name_drives(failed: Sequence[str], drives: int) -> tuple[str, str]:
     """Names of drives that fail alike, as the subject of a sentence, and a cause to append.
 
     Args:
-        failed: Their names.
         drives: Number of drives of the rig.
     """
     if len(failed) == drives:

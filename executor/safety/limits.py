@@ -37,7 +37,6 @@ def monitor_limits(rig: Rig, sync_age: SyncAge, *, slack_counts: bool = True) ->
     """Limits of the monitor.
 
     Args:
-        rig: The robot.
         sync_age: Limit on the age of the last SYNC.
         slack_counts: Whether a slack cable is a fault; otherwise only a tension of NaN is.
     """
@@ -56,7 +55,6 @@ def stuck_limits(rig: Rig, cycle: float) -> tuple[StuckLimits, ...]:
     """Limits of stall detection per drive, from the rig file's motion.
 
     Args:
-        rig: The robot.
         cycle: [s].
     """
     drives = rig.document.drives
@@ -77,7 +75,6 @@ def gate_limits(rig: Rig, setpoints: NDArray[np.int32], cycle: float) -> Limits:
     """The table's own range with the start tolerance, the winches' speed, the following error.
 
     Args:
-        rig: The robot.
         setpoints: The checked table, shape (n, m), [counts].
         cycle: [s].
     """

@@ -144,7 +144,6 @@ class StuckWatch:
 
         Args:
             limits: One per drive.
-            names: Of the drives.
             may_disarm: As in `MonitorLimits`.
         """
         return cls(tuple(Drive(each) for each in limits), tuple(names), may_disarm)

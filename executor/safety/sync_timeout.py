@@ -47,11 +47,7 @@ class SyncAge:
     timeout: float = USUAL_TIMEOUT
 
     def __post_init__(self) -> None:
-        """Refuses a time-out that no cycle could meet.
-
-        Raises:
-            ValueError: It is not longer than one period by enough.
-        """
+        """Refuses a time-out that no cycle could meet."""
         if not self.timeout >= LEAST_TIMEOUT:
             raise ValueError(
                 f"drives that stop after {self.timeout} periods cannot be kept enabled"

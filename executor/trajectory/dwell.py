@@ -94,8 +94,6 @@ def load_violations(
     """Rows whose planned tensions do not hold the load; the worst of each leg and dwell.
 
     Args:
-        rig: The robot.
-        scene: Its loads.
         dwells: In order.
         poses: One per row.
         tensions: Planned, shape (n, m), [N].

@@ -181,7 +181,6 @@ def build_table(
     under them is compensated.
 
     Args:
-        rig: The robot.
         scene: Its stops, dwells and loads.
         legs: Curve and time law of each leg between stops.
         cycle: [s].

@@ -103,9 +103,6 @@ def speed_change(
 
     Args:
         start: Initial speed and acceleration; the acceleration is within its limit.
-        end_speed: Final speed.
-        acceleration: Its limit.
-        jerk: Its limit.
     """
     speed, slope = start
     left = end_speed - speed - slope * abs(slope) / (2.0 * jerk)

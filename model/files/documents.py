@@ -388,7 +388,6 @@ def document_hash(document: BaseModel, without: Collection[str] = ()) -> str:
     program changes no hash; a changed default does.
 
     Args:
-        document: The document.
         without: Top-level keys that do not count.
     """
     content = document.model_dump(mode="json", exclude_defaults=True)
@@ -404,8 +403,6 @@ def write_bytes_atomic(path: Path, data: bytes, *, durable: bool = False) -> Non
     """Writes a whole file or nothing.
 
     Args:
-        path: The file.
-        data: Its content.
         durable: As for `keep_names`.
 
     Raises:

@@ -111,7 +111,6 @@ def copy_examples(
     """Copies all examples, or none when a copy exists already.
 
     Args:
-        examples: The examples.
         folder: Target; created with its parents.
         grouped: In ``configs`` and ``examples`` below the folder, as in a clone.
         replace: Replace files that exist.

@@ -17,7 +17,6 @@ def require_new_file(path: Path, replace: bool = False) -> None:
     """Refuses a file that cannot be written.
 
     Args:
-        path: The file.
         replace: Whether it may exist.
 
     Raises:
@@ -90,7 +89,6 @@ def refuse_overwriting(outputs: Mapping[str, Path], inputs: Iterable[Path]) -> N
 
     Args:
         outputs: Paths to write, by their option, such as ``--output``.
-        inputs: Paths to read.
 
     Raises:
         BadInput: Writing would destroy something.
@@ -159,7 +157,6 @@ def keep_names(folder: Path, *, durable: bool = False) -> None:
     """Syncs a folder to disk, so that new file names survive a power failure.
 
     Args:
-        folder: The folder.
         durable: Refuse a file system that cannot do this, such as a VirtualBox shared folder.
 
     Raises:

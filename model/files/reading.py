@@ -80,7 +80,6 @@ def read_bytes(path: Path, limit: int = TEXT_LIMIT) -> bytes:
     """The content of a regular file.
 
     Args:
-        path: The file.
         limit: Its largest size, [bytes].
 
     Raises:
@@ -197,7 +196,6 @@ def read_json(path: Path, next_step: str) -> Any:
     """The content of a JSON file with finite numbers and unique keys.
 
     Args:
-        path: The file.
         next_step: What to do about a damaged file.
 
     Raises:

@@ -131,7 +131,6 @@ class SimulationDocument(Document):
         """Mismatches with the rest of the rig file.
 
         Args:
-            cables: Number of outlets.
             pulleys: Whether the rig has pulleys.
             cameras: Names of its cameras and their frame rates, [1/s].
         """

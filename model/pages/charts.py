@@ -323,7 +323,6 @@ def thinned(time: Array, values: Array, most: int = MOST_POINTS) -> tuple[Array,
     Args:
         time: Shape (n,).
         values: Shape (n,); NaN is left out.
-        most: Points to keep.
     """
     known = np.flatnonzero(np.isfinite(values))
     if len(known) <= most:
@@ -343,7 +342,6 @@ def with_gaps(
     Args:
         time: Shape (n,).
         columns: A line and the edges of its band, each of shape (n,).
-        most: Points to keep.
         step: Largest step in time of samples of which none is missing, if their steps differ.
     """
     if len(time) < 3:

@@ -31,7 +31,6 @@ def page(
     """The whole page.
 
     Args:
-        title: Plain text.
         body: HTML, such as of `section`.
         lead: HTML below the title.
         scripts: File names in this package, such as ``charts.js``.

@@ -39,7 +39,6 @@ def viewer(
     """The viewer and, for print and without scripts, the still image; HTML.
 
     Args:
-        scene: What is drawn.
         label: What a reader who does not see it should know; plain text.
         layers: Name, title, CSS variable of its colour, and whether it is shown at first.
         hint: More about the image; plain text.

@@ -125,7 +125,6 @@ def weight_wrench(rig: Rig, pose: Pose, load: Load | None = None) -> Array:
     """Wrench of gravity on platform and payload, about the platform's origin, world axes.
 
     Args:
-        rig: The robot.
         pose: ``world_from_platform``.
         load: The scene's load; the wrench includes its payload, not its wrench box.
 

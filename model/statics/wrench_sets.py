@@ -118,7 +118,6 @@ def blocks(count: int, subset_count: int) -> Iterator[slice]:
     """Yield slices that cover a batch of ``count`` poses block by block.
 
     Args:
-        count: Number of poses.
         subset_count: Subsets of the cables per pose; blocks have fewer poses where it is large.
     """
     size = min(max(_ROWS_IN_A_BLOCK // max(subset_count, 1), 1), POSES_IN_A_BLOCK)

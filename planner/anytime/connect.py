@@ -40,7 +40,6 @@ def connect(
     """Grows both trees until they meet; called again with the same trees it continues.
 
     Args:
-        problem: Limits and costs.
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
         trees: Nodes, shape (2, NODES, 3), written.

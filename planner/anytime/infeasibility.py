@@ -54,8 +54,6 @@ def flood_reaches(world: World, ends: Array, cells: int, words: int) -> bool:
     """Whether a flood fill from the first of two positions, (2, 3), [m], reaches the second.
 
     Args:
-        world: Obstacles and workspace.
-        ends: The positions.
         cells: Along each axis.
         words: Number of 64-bit words, one bit for each pair of body and piece.
     """
@@ -156,10 +154,7 @@ def no_path(
     """The error for a search that ended without a path.
 
     Args:
-        rig: The robot.
         scene: Obstacles, start and goal.
-        problem: Limits and costs.
-        search: The finished search.
         settings: Objective, seed and budget.
     """
     values: dict[str, float | str] = {

@@ -34,7 +34,6 @@ def push(
     Args:
         keys: Sort key of each entry and a value stored with it, shape (k, 2).
         entries: Two numbers of each entry, shape (k, 2).
-        count: Entries so far.
         key: Sort key of the new entry.
         value: Value of the new entry.
         first: First number of the new entry.

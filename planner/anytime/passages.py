@@ -74,7 +74,6 @@ def through_passages(
     """Adds samples to a roadmap until it joins start and goal; called again it continues.
 
     Args:
-        problem: Limits and costs.
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
         nodes: Nodes, the first two start and goal, shape (ROADMAP_NODES, 3), written.

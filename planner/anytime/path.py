@@ -295,7 +295,6 @@ def optimal_route(
     """Finds a path and improves it until the budget is spent.
 
     Args:
-        rig: The robot.
         scene: Obstacles, clearances, load, start and goal.
         settings: Objective, seed and budget.
         kinematic: The cost of poses at the start's orientation.

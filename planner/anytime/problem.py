@@ -209,9 +209,7 @@ def problem_of(rig: Rig, scene: Scene, weights: Weights, kinematic: KinematicCos
     """The problem of a scene, with the reserves that `planner.settings` documents.
 
     Args:
-        rig: The robot.
         scene: Obstacles, clearances, load; its start gives the orientation.
-        weights: The objective.
         kinematic: The cost of poses at that orientation.
     """
     rotation = np.array(scene.start.rotation)

@@ -45,7 +45,6 @@ def connect(
     """Grows both trees until they meet; called again with the same trees it continues.
 
     Args:
-        problem: Limits and costs.
         ends: Start and goal, shape (2, 7).
         draws: Random numbers in 0 … 1, a row for a sample, shape (k, DRAWS).
         trees: Nodes, shape (2, NODES, 7), written.

@@ -103,12 +103,10 @@ def replace(
     """Replaces the poses between two by none, one or two, if that is better and allowed.
 
     Args:
-        problem: Limits and costs.
         line: Path with measured moves; changed in place.
         first: Index of the pose before those replaced.
         last: Index of the pose after them.
         new: Replacements, shape (2, 7).
-        number: Number of replacements.
         ends_known: Whether the first and the last new move are parts of existing moves.
         tallies: See `move_allowed`.
 
@@ -205,7 +203,6 @@ def polish(problem: RotatingProblem, line: Line, draws: Array, tallies: Integers
     """Tries changes at random positions; returns the cost of the path afterwards.
 
     Args:
-        problem: Limits and costs.
         line: Path with measured moves; changed in place.
         draws: Random numbers in 0 … 1, a row for a change, shape (k, DRAWS).
         tallies: See `move_allowed`.

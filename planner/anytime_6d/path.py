@@ -231,7 +231,6 @@ def rotating_route(
     """Finds a path in `PoseSpace` and improves it until the budget is spent.
 
     Args:
-        rig: The robot.
         scene: Obstacles, clearances, load, rotation limits, start and goal.
         settings: Objective, seed and budget.
         kinematic: The cost of poses at the start's orientation, which gives its scaling.

@@ -352,7 +352,6 @@ def move_allowed(problem: RotatingProblem, start: Array, end: Array, tallies: In
     """Whether a move keeps every limit; counts the reason if not.
 
     Args:
-        problem: The limits.
         start: A pose, shape (7,).
         end: A pose, shape (7,).
         tallies: Moves checked, by what forbids them, shape (6,); one is incremented.

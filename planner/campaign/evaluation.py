@@ -50,13 +50,10 @@ def run_campaign(
     """Repeats the paper's evaluation (section 5.3, Fig. 9).
 
     Args:
-        rig: The robot.
-        scenes: The paper's environments.
         seeds: Searches of each planner in each case.
         checked: Whether `planner.check.check_path` checks every path of Fig. 9 as well.
         workers: Processes; one per core when left out.
         dask: Address of a Dask cluster to use instead.
-        listener: Receives progress.
 
     Raises:
         BadInput: Dask is not installed, or no scheduler answers.

@@ -72,7 +72,6 @@ def batches(
 
     Args:
         rig: With its own workspace box.
-        scenes: The environments.
         seeds: Searches in each arm of each case.
         checked: Whether the independent check checks the paths of Fig. 9.
     """
@@ -157,7 +156,6 @@ def run_all(batches: Sequence[Batch], pool: Executor | None, progress: Progress)
     """Runs all batches; the trials are in the order of the batches, whichever process ran them.
 
     Args:
-        batches: The searches.
         pool: Other processes or machines; None for this process.
         progress: Called with the number of searches just finished.
     """
@@ -293,7 +291,6 @@ class Results:
     """
 
     def __init__(self, trials: Iterable[Trial]) -> None:
-        """Sorts the trials."""
         self.trials = tuple(trials)
         self._groups: dict[tuple[str, Case, Arm], list[Trial]] = {}
         for trial in self.trials:

@@ -43,7 +43,6 @@ def random_ends(planner: PaperPlanner, distance: float, random: Generator) -> tu
     Args:
         planner: Of the scene; decides what is free.
         distance: Between start and goal, [m].
-        random: Random generator.
 
     Returns:
         Start and goal, shape (3,) each, [m].

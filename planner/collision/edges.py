@@ -49,7 +49,6 @@ def edge_clearance(world: World, start: Array, end: Array) -> tuple[float, int, 
     """The smallest distance of any body to any obstacle along an edge, exact.
 
     Args:
-        world: Rig and obstacles.
         start: World frame, shape (3,), [m].
         end: World frame, shape (3,), [m].
 

@@ -155,8 +155,6 @@ def pair_over_region(
     """Whether two cables keep their distance over a region: `PROVED`, `REFUTED` or `OPEN`.
 
     Args:
-        world: Rig and obstacles.
-        robot: Required distances.
         pair: Index of the pair.
         rotation: ``world_from_platform`` in the middle, shape (3, 3).
         corners: Positions whose hull is the region, shape (k, 3), [m].
@@ -386,9 +384,6 @@ def mark_open_cells(
     """Sets a bit of the cells over which a comparison is not proved; ``which`` as in `compared`.
 
     Args:
-        world: Rig and obstacles.
-        robot: Required distances.
-        which: The comparison.
         masks: See `Robot.open_cells`; changed.
         word: Index of the word in the masks.
         bit: A word with only that bit set.

@@ -37,7 +37,6 @@ def cable_normals(piece: ConvexPiece, eye: Array, needed: float, slack: float) -
     """Candidate unit normals, toward the piece, of planes with ``eye`` before them; shape (k, 3).
 
     Args:
-        piece: The obstacle.
         eye: Where the cable leaves its outlet, world frame, shape (3,), [m].
         needed: Distance by which the piece is grown, [m].
         slack: Room between ``eye`` and the planes, for exits that move on pulleys, [m].
@@ -58,7 +57,6 @@ def platform_normals(piece: ConvexPiece, rotation: Array) -> Array:
     """Candidate unit normals, toward the piece, for the platform; shape (k, 3).
 
     Args:
-        piece: The obstacle.
         rotation: ``world_from_platform``, shape (3, 3).
     """
     signs = np.array([s for s in product((-1.0, 0.0, 1.0), repeat=3) if any(s)])
@@ -190,7 +188,6 @@ def cable_core(piece: ConvexPiece, eye: Array, arm: Array, needed: float) -> Arr
     """Planes behind which the platform's position puts a cable too near to a piece.
 
     Args:
-        piece: The obstacle.
         eye: Where the cable leaves its outlet, world frame, shape (3,), [m].
         arm: From the platform's origin to the anchor, world axes, shape (3,), [m].
         needed: Smallest distance allowed, [m].
@@ -218,7 +215,6 @@ def platform_core(
     """As `cable_core`, for the platform.
 
     Args:
-        piece: The obstacle.
         half_size: Half extents of the platform, shape (3,), [m].
         sum_of_boxes: Half extents of the piece grown by the platform where that is a box, shape
             (3,), [m]; else zeros.

@@ -115,7 +115,6 @@ def build_robot(rig: Rig, world: World, clearance: float) -> Robot:
     """The comparisons on a rig, proved over its workspace as far as possible.
 
     Args:
-        rig: The robot.
         world: Built from it for one orientation; its obstacles are not used.
         clearance: Smallest allowed distance between cables and of cables to the platform, [m].
 
@@ -139,7 +138,6 @@ def unproved_robot(rig: Rig, world: World, clearance: float) -> Robot:
     """As `build_robot`, with nothing proved; only for edges with rotation.
 
     Args:
-        rig: The robot.
         world: Built from it for one orientation; its obstacles are not used.
         clearance: Smallest allowed distance between cables and of cables to the platform, [m].
 
@@ -182,8 +180,6 @@ def self_edge_free(world: World, robot: Robot, start: Array, end: Array) -> bool
     workspace.
 
     Args:
-        world: Rig and orientation.
-        robot: Required distances.
         start: World frame, shape (3,), [m].
         end: World frame, shape (3,), [m].
     """
@@ -226,7 +222,6 @@ def self_rotating_edge_free(
 
     Args:
         world: Rig and obstacles; its own orientation is not used.
-        robot: Required distances.
         start: World frame, shape (3,), [m].
         end: World frame, shape (3,), [m].
         rotation: ``world_from_platform`` at the start, shape (3, 3).

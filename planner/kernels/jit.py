@@ -75,7 +75,6 @@ def stored(
         name: Beginning of the file's name.
         key: Every value that `compute` uses: arrays, or JSON-like.
         shape: Required shape; another one is recomputed.
-        compute: Computes it.
     """
     folder = cache_folder(*KERNELS)
     if folder is None:

@@ -296,8 +296,6 @@ def exit_travel(world: World, cable: int, start: Vector, end: Vector, travel: fl
     from the swivel axis, l the free length.
 
     Args:
-        world: The rig.
-        cable: Its index.
         start: The anchor before, world frame, [m].
         end: The anchor after, [m].
         travel: Most the anchor travels between them, [m].

@@ -31,11 +31,9 @@ class Cost(Protocol):
 
     def edge(self, start: Array, end: Array) -> float:
         """Cost of the straight edge from ``start`` to ``end``, shape (n,) each."""
-        ...
 
     def edges(self, starts: Array, end: Array) -> Array:
         """Costs of straight edges from many points, shape (k, n), to one; shape (k,)."""
-        ...
 
 
 class LengthCost:
@@ -60,7 +58,6 @@ def cheapest_through(path: Array, is_free: IsFree, cost: Cost, spacing: float) -
     Args:
         path: Allowed from node to node, shape (k, n).
         is_free: Whether an edge is allowed.
-        cost: Of edges.
         spacing: Distance of the points spread over the edges, [m].
     """
     points = _spread(path, spacing)
@@ -88,7 +85,6 @@ def pull_tight(path: Array, is_free: IsFree, cost: Cost) -> Array:
     Args:
         path: Allowed from node to node, shape (k, n).
         is_free: Whether an edge is allowed.
-        cost: Of edges.
     """
     tight = path.copy()
     for step in _STEPS:

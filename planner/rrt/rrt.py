@@ -121,7 +121,6 @@ def exact_checks(rig: Rig, scene: Scene, rotation: Array, reserve: float) -> Exa
     """The checks of ``scene`` with ``reserve`` [m] on top of its clearances.
 
     Args:
-        rig: The robot.
         scene: Obstacles, clearances and load.
         rotation: Constant orientation, shape (3, 3).
         reserve: [m].

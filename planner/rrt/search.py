@@ -64,8 +64,6 @@ def shortcut(
 
     Args:
         path: Allowed from node to node, shape (k, 3), [m].
-        limits: Of edges.
-        field: Cost of edges.
         extra: Share by which a shortcut may cost more than what it replaces, to save corners.
 
     Returns:
@@ -144,7 +142,6 @@ class PaperPlanner:
         """Prepares limits and cost.
 
         Args:
-            rig: The robot.
             scene: Obstacles, clearances, load; each search has its own start and goal.
             settings: Sampler, readings, cost, mode and sizes.
             reserve: Added to the scene's clearances, [m].
@@ -180,7 +177,6 @@ class PaperPlanner:
         Args:
             start: Shape (3,), [m].
             goal: Shape (3,), [m].
-            random: Random generator.
             progress: Called every 500 iterations.
         """
         settings = self.settings

@@ -118,8 +118,6 @@ def compute(
 
     Args:
         question: Rig, scene, orientation and quantities.
-        extremes: For the costs.
-        grid: Positions.
         pool: Other processes or machines; None for this process. The values do not depend on it.
         progress: Called with the number of points just finished.
     """
@@ -177,12 +175,10 @@ def workspace_grids(
     """Grids of slices, and of the volume: the frame around it and the region itself.
 
     Args:
-        rig: The robot.
         slices: Axis (0 to 2) and position [m] of planes; the one at home's height when left out.
         volume: Whether the whole box is mapped too; when left out, only without slices.
         step: Distance of points, [m]; a fiftieth of the longest side when left out.
         lower: Corner of the region, shape (3,), [m]; that of the rig's workspace when left out.
-        upper: The opposite corner.
 
     Raises:
         BadInput: A plane is outside the region, or there are too many points.
@@ -222,7 +218,6 @@ def map_workspace(
         grids: Positions, see `workspace_grids`.
         workers: Processes; one per core when left out, in a child process one.
         dask: Address of a Dask cluster to use instead.
-        listener: Receives progress.
 
     Raises:
         BadInput: Dask is not installed, no scheduler answers, or no process can be started.

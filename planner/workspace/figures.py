@@ -82,7 +82,6 @@ def write_figures(
     """Writes each figure as PNG and SVG, the same whatever the user's ``matplotlibrc`` says.
 
     Args:
-        folder: An existing folder.
         drawn: Functions that draw a figure, by its name without suffix.
         settings: Of matplotlib, where they differ from its defaults.
 

@@ -65,7 +65,6 @@ def write_maps(
     Then removes the maps of a former run from the folder.
 
     Args:
-        folder: An existing folder.
         made: Maps of slices, of a volume named ``frame`` for the image of the whole space, and of
             other volumes.
         question: Rig, scene, orientation and quantities of the maps.

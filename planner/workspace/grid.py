@@ -51,9 +51,7 @@ def volume(name: str, lower: Array, upper: Array, step: float) -> Grid:
     """A grid over a box, both ends of every side included.
 
     Args:
-        name: Of the grid.
         lower: Corner, world frame, shape (3,), [m].
-        upper: Opposite corner.
         step: Largest distance between neighbours along an axis, [m].
 
     Raises:

@@ -62,7 +62,6 @@ class Question:
         """All quantities of a rig, or of a rig in a scene.
 
         Args:
-            rig: The robot.
             scene: Obstacles, clearances and load.
             rotation: Shape (3, 3); that of the scene's start, else of home, when left out.
             length: [m]; the root mean square radius of the anchors when left out.

@@ -40,7 +40,6 @@ def structure_columns(
     """Writes the columns of the structure matrix, moments divided by ``length``, as rows.
 
     Args:
-        world: Rig and obstacles.
         rotation: ``world_from_platform``, shape (3, 3).
         position: World frame, [m].
         length: Characteristic length, [m].
@@ -340,7 +339,6 @@ def _least_in_plane(load: LoadArrays, plane: Array, begin: int, volume: float) -
     """The least margin at the facets of four cables and each one from ``begin`` on.
 
     Args:
-        load: Required wrenches.
         plane: The vectors of `_margin_of_many`, projected along the four, shape (2, m + 7).
         begin: The first cable that may be the fifth.
         volume: That of the four.

@@ -42,8 +42,6 @@ def tensions_prove(
     """Whether tensions that follow the displacement prove a region; see the module's docstring.
 
     Args:
-        world: Rig and obstacles.
-        load: Required wrenches.
         reserve: Smallest margin required, [N].
         middle: Of the region, [m].
         spans: The region is the middle and shares from -1 to 1 of each row, shape (k, 3), [m].
@@ -100,8 +98,6 @@ def levers(world: World, cable: int, at: Vector, radius: float) -> tuple[float, 
     Without a pulley both are the free length; where there is no bound, 0 or less.
 
     Args:
-        world: The rig.
-        cable: Its index.
         at: Its anchor in the middle, world frame, [m].
         radius: Largest distance of the anchor from there, [m].
     """
@@ -131,7 +127,6 @@ def tensions_stay(
     """Whether tensions that leave a small residual wrench can be corrected within their limits.
 
     Args:
-        load: Required wrenches.
         reserve: Smallest margin required, [N].
         inverse: Pseudo-inverse in the middle of a region, shape (m, 6).
         tensions: There, shape (m,), [N].

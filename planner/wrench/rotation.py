@@ -102,8 +102,6 @@ def piece_held(
     """Whether wrenches are held over an interval of an edge: `PROVED`, `REFUTED` or `OPEN`.
 
     Args:
-        world: Rig and obstacles.
-        load: Required wrenches.
         reserve: Smallest margin required, [N].
         middle: Position in the middle, [m].
         off: From there to the interval's end, [m].
@@ -191,7 +189,6 @@ def _unit_bend(pulley: float, speed: float, curl: float, reach: float, free: flo
     Args:
         pulley: Radius r, [m]; 0 for point exits.
         speed: Largest speed of the anchor.
-        curl: Its largest acceleration.
         reach: Least distance ρ from the swivel axis, [m].
         free: Least free length l, [m].
     """

@@ -108,8 +108,6 @@ def line_held(
     """Whether wrenches are held from ``middle - off`` to ``middle + off``, [m].
 
     Args:
-        world: Rig and obstacles.
-        load: Required wrenches.
         reserve: Smallest margin required, [N].
         middle: Of the line, [m].
         off: From the middle to its end, [m].

@@ -42,9 +42,7 @@ def draw_cables(
     Args:
         picture: Shape (height, width), changed in place.
         depth: Depth of each pixel along the camera's z axis, same shape, [m].
-        camera: The camera.
         cables: Of the rig, world frame.
-        camera_from_world: Pose.
         radius: Of the cables, [m]; 0 for the default.
     """
     starts, ends = camera_from_world.apply(cables.exits), camera_from_world.apply(cables.anchors)

@@ -93,7 +93,6 @@ def apply_processing(picture: Image8, size: tuple[int, int], optics: Optics) -> 
     Args:
         picture: From the sensor, with noise.
         size: Output width and height, [px].
-        optics: Settings.
     """
     if optics.enlarged > 1:
         picture = np.asarray(cv2.resize(picture, size, interpolation=cv2.INTER_CUBIC), np.uint8)
@@ -178,7 +177,6 @@ class ImageSequence:
     """
 
     def __init__(self, camera: SyntheticCamera) -> None:
-        """Takes the camera; renders nothing yet."""
         self._camera = camera
         self._before: tuple[float, Pose] | None = None
 

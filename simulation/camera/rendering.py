@@ -157,7 +157,6 @@ def draw_quad(
     """Draws a flat image, visible only from its front (+z).
 
     Args:
-        canvas: Target.
         camera_from_quad: Pose with x to the right of the image, y up, z out of it.
         half_size: Half width and half height, [m].
         texture: Brightness 0..255, shape (rows, columns).
@@ -191,7 +190,6 @@ def draw_triangles(canvas: Canvas, vertices: Array, brightness: Array) -> None:
     """Draws triangles visible from both sides, with interpolated brightness.
 
     Args:
-        canvas: Target.
         vertices: Camera frame, shape (n, 3, 3), [m].
         brightness: Of each corner, 0..255, shape (n, 3).
     """

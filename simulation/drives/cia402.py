@@ -105,7 +105,6 @@ class SimulatedDrive(PowerStage):
         """Powers the drive on: it sends boot-up and waits in PRE-OPERATIONAL.
 
         Args:
-            node: CANopen node id.
             position: Of the motor, [counts].
             top_speed: Of the motor, [counts/s].
             send: Sends a frame (identifier, data).

@@ -64,7 +64,6 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
         """Powers the drives on; the first arguments and errors as for `SimulatedRig`.
 
         Args:
-            rig: The robot.
             bus: An open bus for the drives, owned by the caller.
             start_pose: ``world_from_platform``.
             load: Payload of the platform.

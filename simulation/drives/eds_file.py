@@ -227,8 +227,6 @@ def _described(
     """Objects of one section: a variable, or a compact array.
 
     Args:
-        index: Of the section.
-        sub: Of the section.
         section: Its keys and values.
         own: Of a compact array: keys that differ between sub-objects, by key and sub-index.
         where: The section, for messages.

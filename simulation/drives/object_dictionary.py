@@ -57,7 +57,6 @@ class DriveObjects:
     """
 
     def __init__(self, eds: Eds, node: int, behaviour: DriveBehaviour = STRICT) -> None:
-        """Starts with the values after power-on."""
         self.refusals: dict[Key, int] = {}
         self.stuck: set[Key] = set()
         self.judge: Callable[[Key, int], int] = lambda _key, _value: 0
@@ -423,7 +422,6 @@ def motion_settings(
     """Reads the settings of a drive's motion; an absent object limits nothing.
 
     Args:
-        objects: Of the drive.
         counts_per_turn: Of the motor shaft.
         profile: Of its make: what limits its torque, and when its position limits are in force.
     """

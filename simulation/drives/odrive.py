@@ -120,9 +120,7 @@ class SimulatedOdrive:
         """Powers the drive on: idle, with its brake closed.
 
         Args:
-            node: Node id.
             settings: Written with odrivetool.
-            layouts: Of the messages.
             counts_per_turn: Counts of the motor per turn of the drive.
             torque_constant: Of the motor, [N·m/A].
             position: Of the motor, [counts].

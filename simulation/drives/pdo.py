@@ -114,8 +114,6 @@ class ProcessData:
         """Abort code of a write to a parameter; 0 to accept it.
 
         Args:
-            key: The object.
-            value: To be written.
             may_map: The NMT state allows mapping.
         """
         index, sub = key
@@ -218,7 +216,6 @@ class Deadlines:
     """Times [s] by event; checking is cheap as long as none has passed."""
 
     def __init__(self) -> None:
-        """Starts without deadlines."""
         self._due: dict[Hashable, float] = {}
         self.earliest = inf
 

@@ -211,7 +211,6 @@ def hang_still(
     with the set of cables that are stretched there.
 
     Args:
-        hanging: Rig and weight.
         unstrained: Lengths of the whole cables, shape (m,), [m].
         position: Of the platform, shape (3,), [m]; overwritten by the result.
         rotation: Matrix, shape (3, 3); overwritten by the result.

@@ -57,6 +57,26 @@ def test_every_public_name_is_what_editors_see_under_it(package: str) -> None:
         assert getattr(module, name).__doc__, name
 
 
+def undescribed(name: str, value: Any) -> list[str]:
+    """Arguments of a function, or a class's methods, absent in a docstring that lists some."""
+    if inspect.isclass(value):
+        own = [one for one in vars(value).values() if inspect.isfunction(one)]
+        public = [one for one in own if one.__name__ == "__init__" or one.__name__[0] != "_"]
+        return [gap for one in public for gap in undescribed(f"{name}.{one.__name__}", one)]
+    text = inspect.getdoc(value) or ""
+    if "\nArgs:\n" not in text or not inspect.isroutine(value):
+        return []
+    arguments = [one for one in inspect.signature(value).parameters if one != "self"]
+    return [f"{name}: {one}" for one in arguments if f"\n    {one}:" not in text.replace("*", "")]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_a_public_docstring_describes_all_arguments_or_none(package: str) -> None:
+    module: Any = importlib.import_module(package)
+    names = ((name, getattr(module, name)) for name in module.__all__)
+    assert [gap for one in names for gap in undescribed(*one)] == []
+
+
 def test_a_misspelt_name_is_an_ordinary_attribute_error() -> None:
     import cdpr
 

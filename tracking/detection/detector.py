@@ -63,7 +63,6 @@ def squares_in(image: Image, family: str) -> list[Array]:
     """Outlines of squares, clockwise on the screen from any corner, shape (4, 2) each, [px].
 
     Args:
-        image: Grey image.
         family: Of the tags searched for.
     """
     found: list[Array] = []
@@ -233,7 +232,6 @@ def region_around(camera: Camera, points: Array, slack: float) -> Region | None:
     """The region around world points, or None if out of view.
 
     Args:
-        camera: The camera.
         points: World frame, shape (n, 3), [m].
         slack: Border on each side, as a share of the larger side.
     """

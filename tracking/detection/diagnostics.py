@@ -286,9 +286,7 @@ def edge_faults(
     """Diagnoses an image from the edges of its tags.
 
     Args:
-        image: Grey.
         camera: The camera of the image.
-        squares: The measured tags.
         modules: Along the side of a tag's square.
     """
     corners = distort_pixels(camera, np.array([square.corners for square in squares]))

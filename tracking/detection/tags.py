@@ -121,7 +121,6 @@ def mounted_rotated(
 
     Args:
         tags: As in the rig file.
-        family: Of the tags.
         fit: Whether tags at other poses agree with the images.
     """
     for degrees in _WRONG_ROTATIONS:
@@ -196,7 +195,6 @@ class TagDecoder:
         """Decodes the tag in a square; None if it is not certain.
 
         Args:
-            image: Grey image.
             square: Corners clockwise on the screen, from any, shape (4, 2), [px].
         """
         values = module_brightness(image, square, self._side, around=1)
@@ -219,7 +217,6 @@ def module_brightness(image: Image, square: Array, modules: int, around: int = 0
     """Brightness at the centre of every module of a square.
 
     Args:
-        image: Grey image.
         square: Corners, the first at the upper left of the result, shape (4, 2), [px].
         modules: Along the side of the square.
         around: Rings of modules outside the square to include.
@@ -276,7 +273,6 @@ def carries_tag(image: Image, corners: Array, family: str, number: int) -> bool:
     """Whether the inner modules of a square match a tag's.
 
     Args:
-        image: Grey image.
         corners: In the order of `tracking.detection.tags.CORNER_SIGNS`, shape (4, 2), [px], as in
             the image.
         family: Such as ``tag36h11``.
@@ -310,8 +306,6 @@ def agrees_with_modules(
     lens calibration, moves both alike.
 
     Args:
-        image: Grey image.
-        camera: Its lens.
         corners: Undistorted intersections of the tag's measured edges, in the order of
             `CORNER_SIGNS`, shape (4, 2), [px].
         family: Such as ``tag36h11``.

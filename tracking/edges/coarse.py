@@ -38,7 +38,6 @@ def locate_edges(image: Image, quads: Array, bows: Array, widths: Array, found: 
     """Locates the edges of tags.
 
     Args:
-        image: Grey.
         quads: Corners, shape (t, 4, 2), [px].
         bows: Of the edges, shape (t, 4, 2), [px].
         widths: Of a module across each edge, shape (t, 4), [px].

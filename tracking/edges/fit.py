@@ -238,7 +238,6 @@ def fit_edges(
     """Fits the edges of tags.
 
     Args:
-        image: Grey.
         quads: Corners to some tenths of a pixel, shape (t, 4, 2), [px].
         bows: Of the edges, shape (t, 4, 2), [px].
         widths: Of a module across each edge, shape (t, 4), [px].

@@ -157,7 +157,6 @@ def sample_edge(
     """Reads the pixels within ``reach`` of an edge and within a span along it.
 
     Args:
-        image: Grey.
         quad: Corners, shape (4, 2), [px].
         edge: Index of the edge.
         shape: Coefficients of the edge's bow.
@@ -213,7 +212,6 @@ def write_ink(
         quad: Corners, shape (4, 2), [px].
         edge: Index of the edge.
         pixels: Row `INK` is written.
-        count: Of the pixels.
         found: Columns of the edge, with the span read.
         spread: Of the neighbouring edges' blur, [px].
     """
@@ -248,7 +246,6 @@ def write_modules(
         plane: Homography from square coordinates to pixels.
         modules: Along the side of the square.
         pixels: Rows `WITHIN`, `BEYOND` and those from `MODULES` on are written.
-        count: Of the pixels.
         found: Columns of the edge, with the span read.
         spread: Of the neighbouring edges' blur, [px].
     """

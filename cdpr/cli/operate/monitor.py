@@ -156,11 +156,7 @@ class _Operator:
         """Text below the state."""
 
     def between(self, seconds: float) -> Sequence[bytes]:
-        """See `executor.remote.client.follow_run`.
-
-        Raises:
-            KeyboardInterrupt: The operator ends the monitor.
-        """
+        """See `executor.remote.client.follow_run`."""
         if self._keys is None:
             time.sleep(seconds)
             return ()
@@ -195,7 +191,6 @@ class _Robot:
     """Pose and clearance of a run from its encoders; rig and plan come from its folder."""
 
     def __init__(self) -> None:
-        """Before the first status."""
         self._view: RobotView | None = None
 
     def seen(self, status: dict[str, Any]) -> tuple[RobotView, RobotNow] | None:

@@ -128,7 +128,6 @@ def supervise(
         motion: Called with ``listener``, ``confirm`` and ``supervisor``; signals go to the run once
             the operator agreed.
         rig: Simulated drives move without a question.
-        yes: Other drives, too.
         as_json: Standard output is for a program.
     """
     ask = confirmation(asks=not (is_simulated(rig) or yes), as_json=as_json)
@@ -189,11 +188,7 @@ def show_files(result: RunResult, as_json: bool) -> None:
 
 
 def _simulated(rig: Rig, interface: str | None, channel: str | None) -> Rig:
-    """The rig of a plan, with drives simulated in this process.
-
-    Raises:
-        BadInput: A bus was given; a plan must not decide which drives move.
-    """
+    """The rig of a plan, with drives simulated in this process."""
     if channel is not None or interface not in (None, IN_PROCESS):
         raise BadInput(
             "a run on a bus needs the rig file",

@@ -181,11 +181,7 @@ class RunSupervisor(SignalSupervisor):
         return self._given_up
 
     def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        """Interrupts before the motion, only answers until the verdict, then skips the files.
-
-        Raises:
-            KeyboardInterrupt: Nothing moved.
-        """
+        """Interrupts before the motion, only answers until the verdict, then skips the files."""
         if not self.moved:
             raise KeyboardInterrupt
         if self._given_up and self.code is not None:
