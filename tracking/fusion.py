@@ -29,6 +29,8 @@ GATE = 27.9
 DISAGREE = "disagree"
 #: Clocks are compared from this number of frame sets on.
 LEAST_FRAME_SETS = 10
+#: Velocities for that are of the frame sets in this time, at least five, [s].
+MOTION_WINDOW = 0.5
 
 
 class MultiCameraFusion:
@@ -207,38 +209,39 @@ class ClockComparison:
 
     Their disagreement is fitted by an offset and a matrix times the position, for errors of lens,
     extrinsics and tags (0 within what the poses and `UNSTATED_ERROR` state), plus a time times the
-    velocity, and a share of the change of velocity, to which an offset also leads.
+    velocity, and half its square times the acceleration.
     """
 
     def __init__(self, first: str, second: str) -> None:
         """Starts without poses of two cameras, given by name."""
         self._names = (first, second)
-        self._newest: deque[tuple[PoseMeasurement, PoseMeasurement]] = deque(maxlen=3)
+        self._newest: deque[tuple[PoseMeasurement, PoseMeasurement]] = deque()
         self._start, self._prior = np.zeros(3), np.zeros((14, 14))
         self._normal, self._sum, self._cost = np.zeros((14, 14)), np.zeros(14), 0.0
         self._count, self._speed_2, self._speed_4 = 0, 0.0, 0.0
 
     def add(self, first: PoseMeasurement, second: PoseMeasurement) -> None:
-        """Adds the poses of a frame set; the velocity is that between its neighbours."""
-        self._newest.append((first, second))
-        if len(self._newest) < 3:
+        """Adds the poses of a frame set; the motion at the middle one is that of its neighbours."""
+        newest = self._newest
+        if newest and not 0.0 < first.time - newest[-1][0].time <= MEMORY:
+            newest.clear()
+        newest.append((first, second))
+        while len(newest) > 5 and first.time - newest[0][0].time > MOTION_WINDOW:
+            newest.popleft()
+        if len(newest) < 5:
             return
-        before, (a, b), after = self._newest
-        spans = np.array([new.time - old.time for old, new in zip(before, after, strict=True)])
-        if not np.all((spans > 0.0) & (spans <= 2.0 * MEMORY)):
-            return
-        old, here, new = (np.array([one.pose.position for one in pair]) for pair in self._newest)
-        velocity = np.mean((new - old) / spans[:, None], axis=0)
-        second_difference = np.mean(new - 2.0 * here + old, axis=0)
+        a, b = newest[len(newest) // 2]
+        here = np.array([one.pose.position for one in (a, b)])
+        velocity, acceleration = np.mean([_motion(one) for one in zip(*newest, strict=True)], 0)
         if self._count == 0:
             self._start = here[0]
             stated = (a.shared + b.shared)[:3, :3] + 2.0 * np.diag(UNSTATED_ERROR[:3] ** 2)
             self._prior[:3, :3] = np.linalg.inv(stated)
             self._prior[3:12, 3:12] = np.eye(9) / (2.0 * UNSTATED_ERROR[3] ** 2)
-            self._prior[13, 13] = 1.0
+            self._prior[13, 13] = 0.02**-2.0  # half the square of an offset of 0.2 s
         gap = here[1] - here[0] - velocity * (b.time - a.time)
         by_position = np.kron(np.eye(3), here[0] - self._start)
-        row = np.column_stack([np.eye(3), by_position, velocity, second_difference])
+        row = np.column_stack([np.eye(3), by_position, velocity, acceleration])
         weighted = row.T @ np.linalg.inv((a.covariance + b.covariance)[:3, :3])
         self._normal += weighted @ row
         self._sum += weighted @ gap
@@ -272,6 +275,14 @@ class ClockComparison:
             f" {abs(late) * 1e3:.0f} ± {np.ceil(Z_95 * sigma * 1e3):.0f} ms (95 %) later than those"
             f" of {earlier} with the same time; compare their clocks and latency_ms{otherwise}"
         )
+
+
+def _motion(poses: Sequence[PoseMeasurement]) -> Array:
+    """Velocity and acceleration at the middle pose of at least five by a quartic, shape (2, 3)."""
+    times = np.array([one.time for one in poses]) - poses[len(poses) // 2].time
+    powers = np.vander(times, 5, increasing=True)
+    fit = np.linalg.lstsq(powers, np.array([one.pose.position for one in poses]), rcond=None)[0]
+    return np.array([fit[1], 2.0 * fit[2]])
 
 
 # Synchronization of images from several cameras.

@@ -261,8 +261,9 @@ def clock_remarks(
     rng: np.random.Generator,
     tilt: float,
     apart: float = 0.0,
+    rate: float = 10.0,
 ) -> list[str]:
-    """Remarks on two cameras with 10 images per second.
+    """Remarks on two cameras.
 
     Args:
         path: Position at a time [s], [m].
@@ -271,11 +272,12 @@ def clock_remarks(
         rng: Generator.
         tilt: Standard deviation of each camera's rotation about a point 1.5 m away, [rad].
         apart: Difference of the times of a frame set, [s].
+        rate: Images per second.
     """
     eyes = [np.array([1.1, 0.0, 1.4]), np.array([0.0, -1.1, 1.4])]
     tilts = [matrix_from_rotation_vector(rng.normal(size=3) * tilt) for _ in eyes]
     common = MultiCameraFusion(0.05)
-    for time in np.arange(0.0, duration, 0.1).tolist():
+    for time in np.arange(0.0, duration, 1.0 / rate).tolist():
         seen = {}
         for name, eye, turn, own in zip(("a", "b"), eyes, tilts, (0.0, apart), strict=True):
             true = path(time + own + (late if name == "b" else 0.0))
@@ -302,6 +304,28 @@ def test_an_offset_between_clocks_is_measured_beside_errors_of_the_cameras_poses
         assert int(stated[3]) <= 3
         assert float(stated[2]) == pytest.approx(abs(late) * 1e3, abs=4.0)
         assert text.endswith("compare their clocks and latency_ms")
+
+
+def swinging(time: float) -> Array:
+    """A closed curve at about 60 mm/s."""
+    return np.array(
+        [0.06 * np.sin(time), 0.04 * np.sin(0.8 * time), 0.4 + 0.03 * np.sin(0.7 * time)]
+    )
+
+
+@pytest.mark.parametrize("path", [there_and_at_rest, swinging])
+@pytest.mark.parametrize("late", [0.08, -0.12])
+@pytest.mark.parametrize("rate", [4.0, 30.0])
+def test_the_interval_contains_the_offset_at_any_number_of_images_per_second(
+    path: Callable[[float], Array], late: float, rate: float
+) -> None:
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        (text,) = clock_remarks(path, 15.0, late, rng, 1e-3, rate=rate)
+        stated = re.search(r": images of (\w) are taken (\d+) ± (\d+) ms", text)
+        assert stated, text
+        assert stated[1] == ("b" if late > 0.0 else "a")
+        assert abs(int(stated[2]) - abs(late) * 1e3) <= int(stated[3]) <= 8
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.03])
