@@ -29,8 +29,6 @@ GATE = 27.9
 DISAGREE = "disagree"
 #: Clocks are compared from this number of frame sets on.
 LEAST_FRAME_SETS = 10
-#: Velocities for that are of the frame sets in this time, at least five, [s].
-MOTION_WINDOW = 0.5
 
 
 class MultiCameraFusion:
@@ -110,8 +108,7 @@ def fuse_poses(seen: Mapping[str, Observation]) -> Observation:
         if len(poses) == 2:
             a, b = poses.values()
             gap = a.pose.distance_to(b.pose) * 1e3
-            names = " and ".join(poses)
-            return NoPose(a.time, f"cameras {names} {DISAGREE} by {gap:.1f} mm", ())
+            return NoPose(a.time, f"cameras {' and '.join(poses)} {DISAGREE} by {gap:.1f} mm", ())
         del poses[worst]
     return _mean(list(poses.values()))
 
@@ -226,7 +223,7 @@ class ClockComparison:
         if newest and not 0.0 < first.time - newest[-1][0].time <= MEMORY:
             newest.clear()
         newest.append((first, second))
-        while len(newest) > 5 and first.time - newest[0][0].time > MOTION_WINDOW:
+        while len(newest) > 5 and first.time - newest[0][0].time > MEMORY:
             newest.popleft()
         if len(newest) < 5:
             return
@@ -280,8 +277,7 @@ class ClockComparison:
 def _motion(poses: Sequence[PoseMeasurement]) -> Array:
     """Velocity and acceleration at the middle pose of at least five by a quartic, shape (2, 3)."""
     times = np.array([one.time for one in poses]) - poses[len(poses) // 2].time
-    powers = np.vander(times, 5, increasing=True)
-    fit = np.linalg.lstsq(powers, np.array([one.pose.position for one in poses]), rcond=None)[0]
+    fit = np.polynomial.polynomial.polyfit(times, [one.pose.position for one in poses], 4)
     return np.array([fit[1], 2.0 * fit[2]])
 
 
@@ -291,7 +287,7 @@ def _motion(poses: Sequence[PoseMeasurement]) -> Array:
 def synchronize_frames(
     streams: Mapping[str, Iterator[LoggedImage]], within: float
 ) -> Iterator[dict[str, LoggedImage]]:
-    """Groups the images of all cameras into frame sets, in order of time.
+    """Yields frame sets of the images of all cameras, each image once, in order of time.
 
     A frame set has the oldest remaining image and, of each other camera, the nearest one: taken no
     later than ``within`` after it, and nearer to the images of this frame set than to the next
@@ -300,9 +296,6 @@ def synchronize_frames(
     Args:
         streams: Measurements of each camera by its name, each in order of time.
         within: See above, [s].
-
-    Returns:
-        Frame sets by the cameras' names, in their order, each image once, until all streams end.
     """
     queues: dict[str, deque[LoggedImage]] = {name: deque() for name in streams}
     open_streams = dict(streams)
@@ -344,7 +337,6 @@ def _time(picture: LoggedImage) -> float:
 
 
 # Fusion of encoders and camera.
-
 
 #: Drift of the difference: 0.3 mm and 0.05° in one second (random walk).
 DRIFT = np.array([3e-4] * 3 + [np.radians(0.05)] * 3)
@@ -404,9 +396,7 @@ def fuse_with_encoders(
         while waiting and waiting[0].time <= time:
             one = waiting.pop(0)
             there = _at(times, encoder, number, one.time)
-            estimate = (
-                _Difference.first(one, there) if estimate is None else estimate.after(one, there)
-            )
+            estimate = estimate.after(one, there) if estimate else _Difference.first(one, there)
         if estimate is not None:
             yield estimate.applied(pose, time)
 
