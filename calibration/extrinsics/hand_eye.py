@@ -78,9 +78,9 @@ class _PoseObservation:
 class _Stack:
     """n observations as arrays."""
 
-    encoder: Rotation  # n rotations world_from_platform
+    encoder: Array  # (n, 3, 3), rotations world_from_platform
     encoder_position: Array  # (n, 3)
-    camera: Rotation  # n rotations camera_from_tags
+    camera: Array  # (n, 3, 3), rotations camera_from_tags
     camera_position: Array  # (n, 3)
     covariance: Array  # (n, 6, 6)
     shifts: Array  # (n, 6, k), of camera_from_tags by k test values, camera axes
@@ -88,9 +88,9 @@ class _Stack:
     @classmethod
     def of(cls, samples: Sequence[_PoseObservation]) -> _Stack:
         return cls(
-            Rotation.from_matrix([s.world_from_platform.rotation for s in samples]),
+            np.array([s.world_from_platform.rotation for s in samples]),
             np.array([s.world_from_platform.position for s in samples]),
-            Rotation.from_matrix([s.camera_from_tags.rotation for s in samples]),
+            np.array([s.camera_from_tags.rotation for s in samples]),
             np.array([s.camera_from_tags.position for s in samples]),
             np.array([s.covariance for s in samples]),
             np.zeros((len(samples), 6, 0)),
@@ -104,13 +104,14 @@ class _Stack:
             tags: ``platform_from_tags``.
             test: Test values, shape (k,).
         """
-        turn, own = Rotation.from_matrix(camera.rotation), Rotation.from_matrix(tags.rotation)
-        there = self.encoder.apply(np.array(tags.position)) + self.encoder_position
+        there = self.encoder @ tags.position + self.encoder_position
         shift = self.shifts @ test
-        here = turn.apply(self.camera_position + shift[:, :3]) + camera.position
-        seen = Rotation.from_rotvec(shift[:, 3:]) * self.camera if len(test) else self.camera
-        turns = (self.encoder * own) * (turn * seen).inv()
-        return np.hstack([there - here, turns.as_rotvec()])
+        here = (self.camera_position + shift[:, :3]) @ camera.rotation.T + camera.position
+        seen = self.camera
+        if len(test):
+            seen = Rotation.from_rotvec(shift[:, 3:]).as_matrix() @ seen
+        turns = self.encoder @ tags.rotation @ (camera.rotation @ seen).transpose(0, 2, 1)
+        return np.hstack([there - here, Rotation.from_matrix(turns).as_rotvec()])
 
     def whitening(self, camera: Pose, noise: tuple[float, float]) -> Array:
         """Whitening of the gaps, shape (n, 6, 6); ``noise`` is that of the encoder poses."""
