@@ -6,7 +6,7 @@ import threading
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from itertools import count
+from itertools import count, islice
 
 import cv2
 import numpy as np
@@ -89,9 +89,10 @@ def test_a_truncated_image_is_not_completed_from_the_one_before(
     """Of FFmpeg's image, the bottom would show where the platform was."""
     address = serve(lambda n: half(jpeg(n)) if n % 3 == 2 else jpeg(n))
     with LiveCamera(address, small, needs_times=False) as live:
-        while live.truncated < 20:
+        for _ in range(60):
             top, bottom = parts(live.read().image)
             assert top == pytest.approx(bottom, abs=3.0)
+        assert live.truncated > 0
 
 
 def test_a_camera_with_truncated_images_only_is_lost(
@@ -106,7 +107,7 @@ def test_a_camera_with_truncated_images_only_is_lost(
         LiveCamera(address, small, needs_times=False) as live,
         pytest.raises(Fault, match=words) as caught,
     ):
-        list(live)
+        list(islice(live, 2000))
     assert "overloaded" in caught.value.why
 
 
@@ -119,7 +120,7 @@ def test_an_image_of_another_size_is_refused_whenever_it_comes(
         LiveCamera(address, small, needs_times=False) as live,
         pytest.raises(BadInput, match=f"{WIDTH // 2} x {HEIGHT // 2} px"),
     ):
-        list(live)
+        list(islice(live, 2000))
 
 
 @pytest.mark.parametrize("protocol", ["http", "rtsp"])
@@ -148,7 +149,7 @@ def test_an_interrupted_network_camera_is_not_looked_for_at_the_usb_port(
         LiveCamera(serve(image), small, needs_times=False) as live,
         pytest.raises(Fault, match="failed to deliver an image") as caught,
     ):
-        list(live)
+        list(islice(live, 2000))
     assert "USB" not in caught.value.why
     assert "network" in caught.value.next_step
 
