@@ -247,13 +247,13 @@ def track_sources(
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
     for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
-        late = frames.late if isinstance(frames, LiveCamera) else 0
-        for text in _not_measured(check.count, late):
+        skipped = (frames.late, frames.truncated) if isinstance(frames, LiveCamera) else (0, 0)
+        for text in _not_measured(check.count, *skipped):
             listener.remark(f"camera {camera.name}: {text}")
     return result
 
 
-def _not_measured(copies: int, late: int) -> Iterator[str]:
+def _not_measured(copies: int, late: int, truncated: int) -> Iterator[str]:
     """Why images of a camera were not measured, and how many."""
     if copies:
         are = "1 image is an exact copy" if copies == 1 else f"{copies} images are exact copies"
@@ -264,6 +264,9 @@ def _not_measured(copies: int, late: int) -> Iterator[str]:
     if late:
         were = "1 image came late and was" if late == 1 else f"{late} images came late and were"
         yield f"{were} skipped, as the delay in the network or the computer is unknown"
+    if truncated:
+        were = "1 image was" if truncated == 1 else f"{truncated} images were"
+        yield f"{were} truncated and not measured: the camera or the network is overloaded"
 
 
 def _simultaneous(

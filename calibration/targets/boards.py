@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.live import silent_opencv
+from drivers.cameras.frame_reader import silent_opencv
 from model.errors import BadInput, require_fields
 from model.files.camera_file import FAMILIES
 from model.files.csv_table import CsvTable

@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -29,6 +30,7 @@ FROZEN = 60.0
 END_TIMEOUT, ROUND = 2.0, 0.1
 NOT_OPENED = "cannot be opened"
 NOT_ON_TIME = f"delivered no image on time for {FROZEN:g} s"
+TRUNCATED = f"delivered no complete image for {FROZEN:g} s"
 """Why a camera delivers no images, as a predicate."""
 
 
@@ -217,15 +219,43 @@ class CopyCheck:
         return is_copy
 
 
+class _OpencvLog:
+    """The log of OpenCV, of which a process has one."""
+
+    def __init__(self) -> None:
+        self._lock, self._holders, self._level = threading.Lock(), 0, 0
+
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """Keeps OpenCV's warnings, which mean nothing to an operator, from the terminal."""
+        logging = cv2.utils.logging
+        with self._lock:
+            if not self._holders:
+                self._level = logging.getLogLevel()
+                logging.setLogLevel(logging.LOG_LEVEL_SILENT)
+            self._holders += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._holders -= 1
+                if not self._holders:
+                    logging.setLogLevel(self._level)
+
+
+silent_opencv = _OpencvLog().silent
+
+
 class FrameReader:
-    """Opens a camera and reads all its images in a thread.
+    """Opens a camera and reads all its images in a thread, in which OpenCV logs nothing.
 
     Images that waited in a queue are skipped, unless the driver states their times, and so are
-    copies.
+    copies and truncated images.
 
     Attributes:
         lost: Why the camera delivers no more, as a predicate of it.
         late: Number of images skipped as they may have waited, since the first on time.
+        truncated: Number of truncated images since then.
     """
 
     def __init__(
@@ -245,7 +275,7 @@ class FrameReader:
         self._opened, self._clock, self._needs_times = opened, clock, needs_times
         self._changed = threading.Condition()
         self._newest: Arrived | None = None
-        self.lost, self.late = "", 0
+        self.lost, self.late, self.truncated = "", 0, 0
         self._ended = self._is_closing = False
         self._thread = threading.Thread(target=self._read, name="cdpr-pictures", daemon=True)
         self._thread.start()
@@ -274,11 +304,12 @@ class FrameReader:
 
     def _read(self) -> None:
         try:
-            capture = self._opened()
-            try:
-                self._read_all(capture)
-            finally:
-                capture.release()
+            with silent_opencv():
+                capture = self._opened()
+                try:
+                    self._read_all(capture)
+                finally:
+                    capture.release()
         finally:
             with self._changed:
                 self._ended = True
@@ -286,10 +317,11 @@ class FrameReader:
 
     def _read_all(self, capture: cv2.VideoCapture) -> None:
         """Puts each image of a camera until that is lost, or this closed."""
-        number = failed = 0
+        number, failed = -1, 0
         copies, schedule, driver_times = CopyCheck(), ArrivalSchedule(), DriverTimes()
         latest, is_used = self._clock() + FROZEN, False
         self.lost = "" if capture.isOpened() else NOT_OPENED
+        decoded = _decoded_jpeg if not self.lost and _delivers_jpeg(capture) else np.asarray
         while not (self.lost or self._is_closing):
             good, picture = capture.read()
             now = self._clock()
@@ -298,23 +330,49 @@ class FrameReader:
                 self.lost = f"failed to deliver an image {LOST_IMAGES} times in a row"
             if not good:
                 continue
+            number += 1
             time = driver_times.time(now, _stated_time(capture))
             is_on_time = schedule.is_on_time(now) or time is not None or not self._needs_times
-            arrived = Arrived(number, now if time is None else time, np.asarray(picture))
-            number += 1
-            is_copy = copies.is_copy(arrived.picture)
-            self.late += is_used and not is_on_time
-            if is_on_time and not (is_copy and is_used):
+            image = decoded(picture)
+            is_copy = image is not None and copies.is_copy(image)
+            self.truncated += is_used and image is None
+            self.late += is_used and image is not None and not is_on_time
+            if image is not None and is_on_time and not (is_copy and is_used):
                 is_used, latest = True, now + FROZEN
-                self._put(arrived)
+                self._put(Arrived(number, now if time is None else time, image))
             elif now > latest:
                 same = f"delivered the same image for {FROZEN:g} s"
-                self.lost = same if is_copy else NOT_ON_TIME
+                self.lost = TRUNCATED if image is None else same if is_copy else NOT_ON_TIME
 
     def _put(self, arrived: Arrived) -> None:
         with self._changed:
             self._newest = arrived
             self._changed.notify_all()
+
+
+_MJPEG = cv2.VideoWriter.fourcc(*"MJPG")
+
+
+def _delivers_jpeg(capture: cv2.VideoCapture) -> bool:
+    """Makes a camera whose images FFmpeg receives as JPEG deliver them undecoded.
+
+    FFmpeg would leave the missing part of a truncated image as it was in the one before, and OpenCV
+    scale an image of another size to that of the first.
+    """
+    return (
+        capture.getBackendName() == "FFMPEG"
+        and capture.get(cv2.CAP_PROP_FOURCC) == _MJPEG
+        and capture.set(cv2.CAP_PROP_FORMAT, -1)
+    )
+
+
+def _decoded_jpeg(data: NDArray[np.generic]) -> NDArray[np.generic] | None:
+    """The grey image in the data of a JPEG file; None if it is truncated."""
+    try:
+        flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+        return cv2.imdecode(np.asarray(data, np.uint8), flags)
+    except cv2.error:  # no data, or a size beyond its limit
+        return None
 
 
 def _stated_time(capture: cv2.VideoCapture) -> float:

@@ -7,7 +7,7 @@ import re
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.cameras.frame_reader import NOT_ON_TIME, NOT_OPENED, FrameReader
+from drivers.cameras.frame_reader import (
+    NOT_ON_TIME,
+    NOT_OPENED,
+    TRUNCATED,
+    FrameReader,
+    silent_opencv,
+)
 from model.errors import (
     BadInput,
     Fault,
@@ -203,7 +209,8 @@ class LiveCamera(FrameSource):
         needs_times: bool = True,
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
-        self._stopped, self._seen, self._latency = stopped, False, camera.latency
+        self._stopped, self._seen, self._camera = stopped, False, camera
+        self._is_address = "://" in str(source)
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
             raise BadInput(
@@ -222,7 +229,7 @@ class LiveCamera(FrameSource):
         # A caller that only iterates does not close it, and the thread must not outlive it.
         self._finalizer = weakref.finalize(self, self._reader.close)
         try:
-            refuse_wrong_size(self.read().image, camera, self.name)
+            self.read()
         except BaseException:
             self.close()
             raise
@@ -239,28 +246,19 @@ class LiveCamera(FrameSource):
         Raises:
             HardwareMissing: The camera never delivered an image.
             Fault: It stopped delivering images.
+            BadInput: The image has another size.
             StoppedByOperator: Stopped before the next image.
         """
         arrived = self._reader.newest(self._stopped)
         if arrived is not None:
             self._seen = True
             number, image = arrived.number, _grey(arrived.picture)
-            return Frame(arrived.time - self._latency, image, f"image {number}", number)
+            refuse_wrong_size(image, self._camera, self.name)
+            return Frame(arrived.time - self._camera.latency, image, f"image {number}", number)
         if self._stopped():
             what = "stopped before the camera delivered an image"
             raise StoppedByOperator(what, where=self.name)
-        if self._reader.lost == NOT_OPENED:
-            why = "it is not connected, another program uses it, or you may not read it"
-            next_step = (
-                "check the cable and `ls -l /dev/video*`, close other programs, or name another"
-                " camera"
-            )
-        elif self._reader.lost == NOT_ON_TIME:
-            why = "its images come too unevenly for their times to be known"
-            next_step = "use a cable instead of Wi-Fi, or a fixed exposure"
-        else:
-            why = "it was unplugged or hangs, its USB bus is too slow, or its lens is covered"
-            next_step = "check the cable, then start again"
+        why, next_step = _likely_cause(self._reader.lost, self._is_address)
         kind = Fault if self._seen else HardwareMissing
         what = f"the camera {self._reader.lost or 'delivers no more images'}"
         raise kind(what, where=self.name, why=why, next_step=next_step)
@@ -270,9 +268,50 @@ class LiveCamera(FrameSource):
         """Number of images skipped after the first, as they may have waited in a queue."""
         return self._reader.late
 
+    @property
+    def truncated(self) -> int:
+        """Number of images skipped after the first, as they were truncated."""
+        return self._reader.truncated
+
     def close(self) -> None:
         """Releases the camera."""
         self._finalizer()
+
+
+def _likely_cause(lost: str, is_address: bool) -> tuple[str, str]:
+    """Why a camera may deliver no images, and the next step; ``lost`` as `FrameReader` has it."""
+    if lost == NOT_ON_TIME:
+        return (
+            "its images come too unevenly for their times to be known",
+            "use a cable instead of Wi-Fi, or a fixed exposure",
+        )
+    if lost == TRUNCATED:
+        return (
+            "the camera or the network is overloaded, or the camera is defective",
+            "lower its rate or the size of its images, or use a cable instead of Wi-Fi",
+        )
+    if is_address and lost == NOT_OPENED:
+        return (
+            "the address, user or password is wrong, the camera is off or cannot be reached, or it"
+            " delivers no video that OpenCV can read",
+            "open the address on this computer (http:// in a browser, rtsp:// in a player such as"
+            " VLC) and correct it, or set the camera to MJPEG or H.264",
+        )
+    if is_address:
+        return (
+            "it hangs or was switched off, the network is interrupted, or its lens is covered",
+            "check its power and network, and open the address on this computer (http:// in a"
+            " browser, rtsp:// in a player such as VLC), then start again",
+        )
+    if lost == NOT_OPENED:
+        return (
+            "it is not connected, another program uses it, or you may not read it",
+            "check the cable and `ls -l /dev/video*`, close other programs, or name another camera",
+        )
+    return (
+        "it was unplugged or hangs, its USB bus is too slow, or its lens is covered",
+        "check the cable, then start again",
+    )
 
 
 def live_name(camera: str, source: str) -> str:
@@ -331,17 +370,6 @@ def _opened(source: int | str) -> cv2.VideoCapture:
         capture = cv2.VideoCapture(source)
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
         return capture
-
-
-@contextmanager
-def silent_opencv() -> Iterator[None]:
-    """Keeps OpenCV's warnings, which mean nothing to an operator, from the terminal."""
-    before = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
-    try:
-        yield
-    finally:
-        cv2.utils.logging.setLogLevel(before)
 
 
 def _grey(picture: NDArray[np.generic]) -> Image:

@@ -86,10 +86,24 @@ class SetupLink:
         data = self._layouts.rxsdo.pack(OPCODE_READ, endpoint, 0)
         self._send(node, self._layouts.rxsdo.command, data[:4])
 
-    def write(self, node: int, endpoint: int, raw: int, size: int) -> None:
-        """Writes the value of an endpoint, of ``size`` bytes."""
-        data = self._layouts.rxsdo.pack(OPCODE_WRITE, endpoint, raw)
-        self._send(node, self._layouts.rxsdo.command, data[: 4 + size])
+    def write(self, node: int, endpoint: int, value: bytes) -> None:
+        """Writes the value of an endpoint."""
+        data = self._layouts.rxsdo.pack(OPCODE_WRITE, endpoint, 0)
+        self._send(node, self._layouts.rxsdo.command, data[:4] + value)
+
+    def endpoint_values(self, timeout: float) -> Iterator[tuple[int, int, bytes]]:
+        """Yields node, endpoint and value of every answer to `read` within a time [s].
+
+        An answer is as long as its value, or 8 bytes; what follows the value is undefined.
+
+        Raises:
+            BusFault: As for `answers`.
+        """
+        layout = self._layouts.txsdo
+        for node, data in self._messages(layout, timeout):
+            values = layout.unpack(data.ljust(8, b"\0"))
+            if len(data) > 4 and values is not None:
+                yield node, int(values[0]), data[4:]
 
     def answers(self, layout: Layout, timeout: float) -> Iterator[tuple[int, tuple[float, ...]]]:
         """Yields node and values of every message of a kind within a time [s].
@@ -97,16 +111,17 @@ class SetupLink:
         Raises:
             BusFault: The bus failed, or another program commands a drive.
         """
-        for message in self._frames(timeout):
-            node, command = node_and_command(message.arbitration_id)
-            if command != layout.command:
-                continue
-            data = bytes(message.data)
-            if layout is self._layouts.txsdo and len(data) > 4:  # as long as its value is
-                data = data.ljust(8, b"\0")
+        for node, data in self._messages(layout, timeout):
             values = layout.unpack(data)
             if values is not None:
                 yield node, values
+
+    def _messages(self, layout: Layout, timeout: float) -> Iterator[tuple[int, bytes]]:
+        """Node and data of every message of a kind within a time [s]."""
+        for message in self._frames(timeout):
+            node, command = node_and_command(message.arbitration_id)
+            if command == layout.command:
+                yield node, bytes(message.data)
 
     def _send(self, node: int, command: int, data: bytes) -> None:
         identifier = can_id(node, command)
@@ -195,7 +210,7 @@ def configure_drives(
     if known is not None:
         for node in nodes:
             for wanted in wanted_settings(document, layouts):
-                _set(link, layouts, node, known.by_name[wanted.name], wanted)
+                _set(link, node, known.by_name[wanted.name], wanted)
     for winch in rig.winches:
         turns = SPEED_RESERVE * winch.max_speed * abs(winch.counts_per_metre)
         torque = TORQUE_RESERVE * max_tension / winch.torque_constant * winch.rated_torque
@@ -359,7 +374,7 @@ def _check_idle(
             raise in_error(node, int(errors))
     if any(errors == AxisError.WATCHDOG_TIMER_EXPIRED for errors, _, _ in heartbeats.values()):
         for node in nodes:
-            link.send(node, layouts.clear_errors, 0)
+            link.send(node, layouts.clear_errors)
 
 
 def _check_supply(link: SetupLink, layouts: Layouts, nodes: Sequence[int]) -> None:
@@ -395,23 +410,24 @@ def _check_rates(
                 raise rare
 
 
-def _set(link: SetupLink, layouts: Layouts, node: int, endpoint: Endpoint, wanted: Wanted) -> None:
+def _set(link: SetupLink, node: int, endpoint: Endpoint, wanted: Wanted) -> None:
     """Writes a setting and reads it back."""
-    raw = endpoint.to_raw(wanted.value)
-    link.write(node, endpoint.number, raw, endpoint.size)
+    value = endpoint.to_bytes(wanted.value)
+    link.write(node, endpoint.number, value)
     # Since firmware 0.6.11 writes are confirmed; the confirmation must not be taken for the answer.
-    for _ in link.answers(layouts.txsdo, CONFIRMATION_WAIT):
+    for _ in link.endpoint_values(CONFIRMATION_WAIT):
         pass
     link.read(node, endpoint.number)
-    for answering, (number, reported) in link.answers(layouts.txsdo, RESPONSE_TIMEOUT):
+    for answering, number, answer in link.endpoint_values(RESPONSE_TIMEOUT):
         if answering != node or number != endpoint.number:
             continue
-        if int(reported) == raw:
+        reported = endpoint.value_in(answer, node)
+        if reported == value:
             return
         raise wrong_setting(
             node,
             f"endpoint {endpoint.name}",
-            f"{endpoint.from_raw(int(reported)):g}",
+            f"{endpoint.from_bytes(reported):g}",
             f"{wanted.value:g}",
             wanted.why,
             "see ODrive's API reference; the set-up was not finished: the axes are idle, with part"

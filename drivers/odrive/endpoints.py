@@ -62,26 +62,43 @@ class Endpoint:
     Attributes:
         name: Such as ``axis0.config.enable_watchdog``.
         number: On the bus.
-        form: Type as a `struct` format.
+        type: As in ODrive's file, such as ``uint32``.
     """
 
     name: str
     number: int
-    form: str
+    type: str
 
     @property
     def size(self) -> int:
         """Size of a value, [bytes]."""
-        return struct.calcsize(self.form)
+        return struct.calcsize(_FORMS[self.type])
 
-    def to_raw(self, value: float) -> int:
-        """The four bytes of a value, as the integer in the message."""
-        return int.from_bytes(struct.pack(self.form, value).ljust(4, b"\0"), "little")
+    def to_bytes(self, value: float) -> bytes:
+        """A value as on the bus."""
+        return struct.pack(_FORMS[self.type], value)
 
-    def from_raw(self, raw: int) -> float:
-        """The inverse of `to_raw`."""
-        data = raw.to_bytes(4, "little")
-        return float(struct.unpack_from(self.form, data)[0])
+    def from_bytes(self, data: bytes) -> float:
+        """The inverse of `to_bytes`."""
+        return float(struct.unpack(_FORMS[self.type], data)[0])
+
+    def value_in(self, answer: bytes, node: int) -> bytes:
+        """The value at the begin of a drive's answer.
+
+        Raises:
+            Refused: The answer is too short.
+        """
+        if len(answer) < self.size:
+            plural = "" if len(answer) == 1 else "s"
+            raise Refused(
+                f"its answer has {len(answer)} byte{plural}, a {self.type} has {self.size}",
+                where=f"drive {node}, endpoint {self.name}",
+                why="the number or type in drives.endpoints is not that of the drive",
+                next_step=f"{_OTHER_FILE}; the set-up was not finished: the axes are idle, with"
+                " part of their settings",
+                values={"node": node, "endpoint": self.name},
+            )
+        return answer[: self.size]
 
 
 @dataclass(frozen=True, slots=True)
@@ -225,4 +242,4 @@ def _endpoint(name: str, file: _EndpointsFile) -> Endpoint:
     entry = _EndpointEntry.model_validate(file.endpoints[name])
     if entry.type not in _FORMS:
         raise ValueError(f"{name} has the type {entry.type[:40]!r}, not {' or '.join(_FORMS)}")
-    return Endpoint(name, entry.id, _FORMS[entry.type])
+    return Endpoint(name, entry.id, entry.type)

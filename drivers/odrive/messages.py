@@ -51,7 +51,7 @@ NEEDED: dict[str, tuple[str, ...]] = {
     "Set_Input_Pos": ("Input_Pos", "Vel_FF", "Torque_FF"),
     "Set_Limits": ("Velocity_Limit", "Current_Limit"),
     "Get_Bus_Voltage_Current": ("Bus_Voltage", "Bus_Current"),
-    "Clear_Errors": ("Identify",),
+    "Clear_Errors": (),
     "Get_Torques": ("Torque_Target", "Torque_Estimate"),
 }
 
@@ -403,7 +403,7 @@ class OdriveFrames:
 
     def clear_errors(self, drives: Iterable[int] | None = None) -> list[can.Message]:
         """Clears the errors of every drive, or of some by index."""
-        return [self._frame(n, self._layouts.clear_errors, 0) for n in self._of(drives)]
+        return [self._frame(n, self._layouts.clear_errors) for n in self._of(drives)]
 
     def _of(self, drives: Iterable[int] | None) -> Sequence[int]:
         return self._nodes if drives is None else [self._nodes[drive] for drive in drives]

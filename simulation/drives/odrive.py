@@ -193,15 +193,15 @@ class SimulatedOdrive:
             return
         if self.settings.fed_by_reads:
             self._unfed = 0.0
-        if not data:
-            self._answer(command)
-        elif command == self._layouts.rxsdo.command:
-            self._on_sdo(bytes(data))
-        elif command in self._commands:
+        if command in self._commands:
             layout, act = self._commands[command]
             values = layout.unpack(data)
             if values is not None:
                 act(*values)
+        elif not data:
+            self._answer(command)
+        elif command == self._layouts.rxsdo.command:
+            self._on_sdo(bytes(data))
 
     def fail(self, error: int) -> None:
         """Raises an error: the axis is disarmed, its brake closes."""
@@ -242,7 +242,7 @@ class SimulatedOdrive:
         self.motor.top_speed = min(self._top_speed, speed * self._per_turn)
         self._largest_torque = current * self._torque_constant
 
-    def _clear_errors(self, _identify: int) -> None:
+    def _clear_errors(self) -> None:
         self.errors = 0
 
     def _estop(self) -> None:
@@ -250,9 +250,7 @@ class SimulatedOdrive:
 
     def _answer(self, command: int) -> None:
         """Answers a request, which is a remote frame or a data frame without data."""
-        if command == self._layouts.estop.command:  # the only command without data
-            self._estop()
-        elif command == self._layouts.get_version.command:
+        if command == self._layouts.get_version.command:
             self._send(self._layouts.get_version, 2, *self.settings.board, *self.settings.firmware)
         elif command == self._layouts.get_bus_voltage_current.command:
             self._send(self._layouts.get_bus_voltage_current, self.supply, 0.0)

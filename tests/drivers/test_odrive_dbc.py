@@ -47,7 +47,7 @@ def own() -> Layouts:
         ("set_input_pos", 0x0C, (-2.0, 0.5, -0.001), "000000c0 f401 ffff"),
         ("set_limits", 0x0F, (1.0, 10.0), "0000803f 00002041"),
         ("get_bus_voltage_current", 0x17, (48.0, 0.0), "00004042 00000000"),
-        ("clear_errors", 0x18, (0,), "00"),
+        ("clear_errors", 0x18, (), "00"),
         ("get_torques", 0x1C, (0.0, 1.0), "00000000 0000803f"),
     ],
 )
@@ -85,6 +85,19 @@ def test_messages_lie_where_the_named_file_says(tmp_path: Path) -> None:
     found = read_layouts(path)
     assert found.set_input_pos.pack(0.0, 1.0, 0.0)[4:6] == struct.pack("<h", 10_000)
     assert found.get_torques.command == 30
+
+
+IDENTIFY = ' SG_ Identify : 0|8@1+ (1,0) [0|0] "" ODrive\n'
+
+
+@pytest.mark.parametrize("size", [0, 1, 8])
+def test_errors_are_cleared_with_files_of_any_firmware(tmp_path: Path, size: int) -> None:
+    """Before firmware 0.6.9, Clear_Errors has no data."""
+    path = tmp_path / "old.dbc"
+    text = TEXT.replace("Axis0_Clear_Errors: 1", f"Axis0_Clear_Errors: {size}")
+    assert IDENTIFY in text
+    path.write_text(text if size else text.replace(IDENTIFY, ""))
+    assert read_layouts(path).clear_errors.pack() == bytes(size)
 
 
 @pytest.mark.parametrize(

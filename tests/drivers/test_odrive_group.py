@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
@@ -39,7 +40,7 @@ from model.rig import Rig, rig_from_document
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
 SET_AXIS_STATE, SET_INPUT_POS, GET_IQ = 0x07, 0x0C, 0x14
-HEARTBEAT, ENCODER_ESTIMATES, TORQUES = 0x01, 0x09, 0x1C
+HEARTBEAT, ENCODER_ESTIMATES, TORQUES, TXSDO = 0x01, 0x09, 0x1C, 0x05
 WATCHDOG_S = 0.1
 
 
@@ -779,8 +780,9 @@ def test_settings_are_written_and_read_back_with_the_endpoints_of_the_firmware(
         for drive in bench.drives:
             for wanted in wanted_settings(document, read_layouts()):
                 endpoint = known.by_name[wanted.name]
-                raw = drive.settings.values[endpoint.number]
-                assert endpoint.from_raw(raw) == pytest.approx(float(wanted.value))
+                raw = drive.settings.values[endpoint.number].to_bytes(4, "little")
+                value = endpoint.from_bytes(endpoint.value_in(raw, drive.node))
+                assert value == pytest.approx(float(wanted.value))
 
 
 def dbc_with_steps(path: Path, speed: str, torque: str) -> Path:
@@ -829,6 +831,43 @@ def test_a_setting_that_is_not_kept_is_refused_with_drive_and_endpoint(tmp_path:
             bench.group.configure()
     assert caught.value.where == "drive 7, endpoint axis0.config.watchdog_timeout"
     assert "drives.watchdog_ms" in caught.value.why
+
+
+def answer_endpoints(bench: OdriveBench, changed: Callable[[bytes], bytes]) -> None:
+    """Changes every answer to the reading or writing of an endpoint."""
+    for drive in bench.drives:
+
+        def send(identifier: int, data: bytes, send: Any = drive._send_frame) -> None:
+            is_answer = node_and_command(identifier)[1] == TXSDO
+            send(identifier, changed(bytes(data)) if is_answer else data)
+
+        drive._send_frame = send
+
+
+def test_what_follows_a_value_in_an_answer_does_not_count(tmp_path: Path) -> None:
+    """The size of each value is known; firmware may leave the rest of the frame undefined."""
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    rig = odrive_rig(endpoints=str(file))
+    known = read_endpoints(file, odrive_of(rig), read_layouts()).by_name.values()
+    sizes = {endpoint.number: endpoint.size for endpoint in known}
+
+    def undefined_rest(data: bytes) -> bytes:
+        end = 4 + sizes[int.from_bytes(data[1:3], "little")]
+        return data[:end].ljust(8, b"\xa5")
+
+    with odrive_bench(rig) as bench:
+        answer_endpoints(bench, undefined_rest)
+        assert bench.group.configure() == ()
+
+
+def test_an_answer_shorter_than_its_value_is_refused_as_such(tmp_path: Path) -> None:
+    file = write_endpoints(tmp_path / "flat_endpoints.json", odrive_rig())
+    with odrive_bench(odrive_rig(endpoints=str(file))) as bench:
+        answer_endpoints(bench, lambda data: data[:5])
+        with pytest.raises(Refused, match="its answer has 1 byte, a float has 4") as caught:
+            bench.group.configure()
+    assert caught.value.where == "drive 1, endpoint axis0.config.watchdog_timeout"
+    assert "drives.endpoints" in caught.value.why
 
 
 def test_endpoints_of_another_firmware_are_refused(tmp_path: Path) -> None:
@@ -948,6 +987,16 @@ def test_drives_in_fault_are_taken_to_be_reset(bench: OdriveBench) -> None:
     assert bench.group.read_positions().state is GroupState.FAULT
     bench.group.command(GroupCommand.RESET_FAULT)
     assert bench.cycles(10).state is GroupState.CONFIGURED
+
+
+def test_errors_are_reset_with_the_dbc_file_of_an_older_firmware(tmp_path: Path) -> None:
+    """Its Clear_Errors has no data."""
+    head, body = OWN_DBC.read_text().split("Axis0_Clear_Errors: 1")
+    path = tmp_path / "old.dbc"
+    path.write_text(head + "Axis0_Clear_Errors: 0" + re.sub(r" SG_ Identify .*\n", "", body))
+    with odrive_bench(odrive_rig(dbc=str(path))) as bench:
+        test_drives_in_fault_are_taken_to_be_reset(bench)
+        assert {drive.errors for drive in bench.drives} == {0}
 
 
 def test_capabilities_of_the_drives_are_the_rig_files(bench: OdriveBench) -> None:

@@ -68,6 +68,8 @@ class Queue:
 
     def get(self, what: int) -> float:
         """The time that its driver states is that of the exposure, on a clock of its own."""
+        if what == cv2.CAP_PROP_FOURCC:
+            return cv2.VideoWriter.fourcc(*"H264")
         assert what == cv2.CAP_PROP_POS_MSEC
         return 1e6 + 10.0 * (self._taken - 1)
 

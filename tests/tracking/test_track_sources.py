@@ -149,7 +149,7 @@ def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was
         return Pose.level([0.3 * (time - 5.2), 0.05, 0.4])
 
     class Live:
-        late = 3
+        late, truncated = 3, 2
 
         def __init__(self, _source: str, camera: Camera, **_: object) -> None:
             self._eye = SyntheticCamera(rig, replace(scene, obstacles=()), camera, seed=4)
@@ -167,6 +167,7 @@ def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was
     assert result.together is not None
     assert result.together.without_partner == 0
     assert "camera front: 3 images came late and were skipped" in listener.texts[0]
+    assert "camera front: 2 images were truncated and not measured" in listener.texts[1]
     assert len(result.poses) == 5
     for found in result.poses:
         assert found.pose.distance_to(pose_at(found.time)) < 1e-3
