@@ -7,7 +7,7 @@ cannot be written nor an interrupt while the report is made changes it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -15,26 +15,19 @@ from pathlib import Path
 from typing import Any
 
 from executor.cameras.multi_camera import CameraRecords, CameraWatch
-from executor.cameras.open import asked_rate, open_cameras, require_no_stop
+from executor.cameras.open import asked_rate, open_cameras
 from executor.cameras.sources import (
     CameraChoice,
     cycles_per_image,
     require_synthetic_images,
     resolve_cameras,
 )
-from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
-from executor.drives import (
-    abandoned_drives_fault,
-    drives_of,
-    is_simulated,
-    open_drives,
-    require_drives,
-    require_simulated_start,
-)
+from executor.control.path_runs import Outcome, PathMotion, run_along_path
+from executor.drives import drives_of, is_simulated, require_drives, require_simulated_start
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
-from executor.kernels import ready_to_simulate
 from executor.proposals import Proposal, motion_proposal, require_confirmed
+from executor.realtime.process import Mover
 from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_name
@@ -48,6 +41,7 @@ from executor.run_result import RunResult, folder_maker
 from executor.state_machine import LoopEvent, State
 from executor.supervision import Callbacks, GuardedListener, LocalRequests, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare_plan
+from executor.winch_runs import open_mover
 from model.errors import (
     CdprError,
     StoppedByOperator,
@@ -340,61 +334,31 @@ def _move(
     job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _MotionData
 ) -> Outcome:
     """Arms the drives and runs the loop: here in simulated time, else in another process."""
+    prepared, options = job.prepared, job.options
 
-    def before_motion() -> None:
+    def before_motion(denied: str) -> None:
+        if denied:
+            recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
+            options.listener.remark(denied)
         moved.course = replace(moved.course, started=datetime.now(UTC))
         recorder.writer.take_file(partial(job.folder.write_course, moved.course))
         moved.begun = True
         job.commands.supervisor.on_motion()
 
-    if isinstance(board, SharedRequests):
-        return _move_in_real_time(job, board, recorder, before_motion)
-
-    def confirm_motion() -> None:
-        require_no_stop(board)
-        before_motion()
-
-    prepared = job.prepared
-    start, load = job.options.start or prepared.scene.start, prepared.scene.load
-    with open_drives(prepared.rig, start, load, listener=job.options.listener) as drives:
-        return run_in_process(
-            prepared,
-            drives.group,
-            SimulatedClock(prepared.checked.table.cycle),
+    def mover(motion: PathMotion) -> AbstractContextManager[Mover]:
+        start = options.start or prepared.scene.start
+        return open_mover(
+            prepared.rig,
+            motion,
+            partial(drives_of, prepared.rig.document, start, prepared.scene.load),
             board,
-            recorder,
-            true_pose=drives.true_pose,
-            carry=drives.carry,
-            before_motion=confirm_motion,
+            SimulatedClock(prepared.checked.table.cycle),
+            need_real_time_rights=options.need_real_time_rights,
+            listener=options.listener,
+            after_stop="run it again when ready",
         )
 
-
-def _move_in_real_time(
-    job: _Job, board: SharedRequests, recorder: Recorder, before_motion: Callable[[], None]
-) -> Outcome:
-    prepared, options = job.prepared, job.options
-
-    def armed(denied: str) -> None:
-        if denied:
-            recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
-            options.listener.remark(denied)
-        before_motion()
-
-    simulated = is_simulated(prepared.rig)
-    if simulated:
-        ready_to_simulate(options.listener, only_missing=True)
-    start, load = options.start or prepared.scene.start, prepared.scene.load
-    return run_in_real_time(
-        prepared,
-        partial(drives_of, prepared.rig.document, start, load),
-        board,
-        recorder,
-        pose_every=recorder.every if simulated else 0,
-        need_real_time=options.need_real_time_rights and not simulated,
-        check_drives=partial(abandoned_drives_fault, prepared.rig.document),
-        before_motion=armed,
-        listener=options.listener,
-    )
+    return run_along_path(prepared, mover, recorder, before_motion=before_motion)
 
 
 def _conclude(job: _Job, moved: _MotionData) -> RunResult:
