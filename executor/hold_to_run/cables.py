@@ -26,7 +26,7 @@ from executor.control.winch_laws import (
     TensionReserve,
     tension_reserve,
 )
-from executor.hold_to_run.presses import CablePress, Press, PressReader, PressState
+from executor.hold_to_run.presses import CableMove, Press, PressReader, PressState
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
@@ -277,7 +277,7 @@ class CableTravel:
         moved = np.flatnonzero(np.not_equal(record.targets, self._targets))
         if moved.size:
             self.cable = int(moved[0]) + 1
-        elif isinstance(press, CablePress) and record.rate == 0.0:
-            self.cable = press.cable
+        elif press is not None and isinstance(press.move, CableMove) and record.rate == 0.0:
+            self.cable = press.move.cable
         self._targets, self.by_press = record.targets, record.index / 1000.0
         self._tensions = self._rig.tensions_by(record.torques).tolist()

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from executor import winch_runs
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, JogProver, Piece, PieceRing
-from executor.hold_to_run.presses import TIMEOUT, PressBoard
+from executor.hold_to_run.presses import TIMEOUT, PlatformMove, PressBoard
 from executor.hold_to_run.session import jog_session
 from executor.jogging import with_speed
 from executor.realtime.scheduling import SimulatedClock
@@ -73,9 +73,8 @@ class Script:
 def hold(
     number: int, direction: Array, step: float | None = None, percent: int = 100
 ) -> Callable[[PressBoard], object]:
-    return lambda board: board.hold(
-        number, direction, in_platform=False, step=step, percent=percent
-    )
+    move = PlatformMove(direction, in_platform=False)
+    return lambda board: board.hold(number, move, step=step, percent=percent)
 
 
 def positions(records: list[CycleRecord]) -> Array:
