@@ -31,7 +31,7 @@ from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, State
-from executor.supervision import OperatorRequests, SupervisorCalls
+from executor.supervision import SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.rig import Rig
 from model.winches import WinchMap
@@ -78,6 +78,7 @@ class CableLoop(Loop):
 
     motion_phrase = "together"
     slack_counts = False
+    takes_feed_requests = False  # the held control sets hold and speed
 
     def __init__(
         self,
@@ -183,10 +184,6 @@ class CableLoop(Loop):
         """Length paid out by the latest press, [mm]; negative for wound in."""
         moved = self._sender.resting_targets[self._cable] - self._from
         return 1000.0 * moved / self._rig.winches[self._cable].counts_per_metre
-
-    def _apply_requests(self, requests: OperatorRequests) -> None:
-        """Applies only a stop: the held control sets hold and speed."""
-        self._apply_stop(requests)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
