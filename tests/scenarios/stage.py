@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup
 from drivers.factory import make_drive_group
 from executor.cameras.multi_camera import CameraRecords
-from executor.control.path_runs import Outcome, run_along_path
+from executor.control.path_runs import Outcome, PathMotion, run_along_path
 from executor.evaluation import evaluate, write_end
 from executor.realtime.child import ReadyDrives
 from executor.realtime.process import MotionHere
@@ -63,6 +63,7 @@ class Stage:
     armed: bool = False
     status: RunStatus | None = None
     recorder: Recorder | None = None
+    mover: MotionHere | None = None
     drive_states: list[tuple[DriveState, ...]] = field(default_factory=list)
 
     def next_cycle(self) -> float:
@@ -115,13 +116,12 @@ class Stage:
             progress=progress,
             announce=lambda _text: None,
         )
+        return run_along_path(self.prepared, self._mover, recorder, before_motion=on_armed)
+
+    def _mover(self, motion: PathMotion) -> AbstractContextManager[MotionHere]:
         drives = ReadyDrives(self.prepared.rig, self.group, None, self.rehearsal.carry, ())
-        return run_along_path(
-            self.prepared,
-            lambda motion: nullcontext(MotionHere(motion, drives, self, self.board)),
-            recorder,
-            before_motion=on_armed,
-        )
+        self.mover = MotionHere(motion, drives, self, self.board)
+        return nullcontext(self.mover)
 
     def events(self) -> list[RunEvent]:
         return self.folder.events()
