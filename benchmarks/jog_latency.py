@@ -28,7 +28,7 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from executor.hold_to_run.presses import PressBoard  # noqa: E402
+from executor.hold_to_run.presses import CableMove, PlatformMove, PressBoard  # noqa: E402
 from executor.hold_to_run.session import cable_session, jog_session  # noqa: E402
 from executor.state_machine import CycleRecord, State  # noqa: E402
 from model.rig import Rig, load_rig  # noqa: E402
@@ -82,11 +82,12 @@ class Operator:
         """Sends one message of a press: odd ones forward or in, even ones backward or out."""
         turn, is_even = (number - 1) // 2, number % 2 == 0
         if self.one_cable:
-            cable = 1 + turn % 8
-            return board.hold_cable(number, cable, pays_out=is_even, step=None, percent=100)
+            cable = CableMove(1 + turn % 8, pays_out=is_even)
+            return board.hold(number, cable, step=None, percent=100)
         direction = np.zeros(3)
         direction[turn % 3] = -1.0 if is_even else 1.0
-        return board.hold(number, direction, in_platform=False, step=None, percent=100)
+        move = PlatformMove(direction, in_platform=False)
+        return board.hold(number, move, step=None, percent=100)
 
 
 @contextmanager

@@ -32,8 +32,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from drivers.can_load import SLOWEST_TENTHS_MS, TESTED_HZ, check_bus_load
-from executor.control.path_runs import run_in_real_time
+from executor.control.path_runs import run_along_path
 from executor.drives import drives_of
+from executor.realtime.process import real_time_process
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_folder import RunFolder
@@ -132,14 +133,16 @@ def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Mot
         announce=lambda _text: None,
     )
     start, load = prepared.scene.start, prepared.scene.load
-    outcome = run_in_real_time(
+    outcome = run_along_path(
         prepared,
-        partial(drives_of, prepared.rig.document, start, load),
-        board,
+        lambda motion: real_time_process(
+            motion,
+            partial(drives_of, prepared.rig.document, start, load),
+            board,
+            need_real_time=False,
+            check_drives=lambda _released: "",  # the drives end with their process
+        ),
         recorder,
-        pose_every=0,
-        check_drives=lambda _released: "",  # the drives end with their process
-        need_real_time=False,
         before_motion=note_start,
     )
     print(f"    run ended: {outcome.state.value} {outcome.cause}")

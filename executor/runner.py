@@ -7,7 +7,7 @@ cannot be written nor an interrupt while the report is made changes it.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -15,28 +15,20 @@ from pathlib import Path
 from typing import Any
 
 from executor.cameras.multi_camera import CameraRecords, CameraWatch
-from executor.cameras.open import asked_rate, open_cameras, require_no_stop
+from executor.cameras.open import asked_rate, open_cameras
 from executor.cameras.sources import (
     CameraChoice,
     cycles_per_image,
     require_synthetic_images,
     resolve_cameras,
 )
-from executor.control.path_runs import Outcome, run_in_process, run_in_real_time
-from executor.drives import (
-    abandoned_drives_fault,
-    drives_of,
-    is_simulated,
-    open_drives,
-    require_drives,
-    require_simulated_start,
-)
+from executor.control.path_runs import Outcome, PathMotion, run_along_path
+from executor.drives import drives_of, is_simulated, require_drives, require_simulated_start
 from executor.evaluation import EvaluatedRun, evaluate, not_evaluated, write_end
 from executor.interlock.interlock import MotionInterlock
-from executor.kernels import ready_to_simulate
 from executor.proposals import Proposal, motion_proposal, require_confirmed
+from executor.realtime.process import Mover
 from executor.realtime.scheduling import SimulatedClock
-from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import RunCourse, dated_name
 from executor.recording.recorder import Recorder
 from executor.recording.run_folder import REPORT, RunEvent, RunFolder
@@ -46,8 +38,9 @@ from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import RunStatus
 from executor.run_result import RunResult, folder_maker
 from executor.state_machine import LoopEvent, State
-from executor.supervision import Callbacks, GuardedListener, LocalRequests, Supervisor
+from executor.supervision import Callbacks, GuardedListener, Supervisor
 from executor.trajectory.setpoints import PreparedRun, prepare_plan
+from executor.winch_runs import open_mover
 from model.errors import (
     CdprError,
     StoppedByOperator,
@@ -187,51 +180,23 @@ def run_prepared(
     with options.listener.waiting("loading the report generator"):
         _preload_results()
     commands.require_no_stop()
-    result = _recorded(_Job(prepared, make_folder(), cameras, options, commands))
+    result = _Run(prepared, make_folder(), cameras, options, commands).recorded()
     commands.supervisor.finish()
     return result
 
 
-def _recorded(job: _Job) -> RunResult:
-    """Moves and measures, with a run folder."""
-    prepared, folder = job.prepared, job.folder
-    interface, simulated = prepared.rig.document.bus.interface, is_simulated(prepared.rig)
-    now, fast = datetime.now(UTC), not job.options.realtime
-    course = RunCourse(now, interface, simulated, fast, versions=versions())
-    callbacks = Callbacks(job.commands.board.ask_stop)
-    moved = _MotionData(course, callbacks, GuardedListener(job.options.listener, callbacks))
-    try:
-        folder.write_plan(prepared.plan.plan.document)
-        folder.write_rig(prepared.rig.document)
-        folder.write_course(moved.course)
-        with folder.held():
-            _move_and_measure(job, moved)
-            result = job.commands.supervisor.conclude(partial(_conclude, job, moved))
-    except StoppedByOperator:
-        callbacks.leave()
-        raise
-    finally:
-        moved.close()
-        if not moved.begun:
-            folder.discard()
-    callbacks.leave()
-    return result
+def _preload_results() -> None:
+    """Loads modules of the result files now, as a failure after the motion would lose data."""
+    import cv2  # noqa: F401
+    import scipy.spatial  # noqa: F401
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Job:
-    """One run and its options."""
-
-    prepared: PreparedRun
-    folder: RunFolder
-    cameras: Mapping[Camera, str]
-    options: RunOptions
-    commands: Commands
+    import executor.report.page
+    import executor.report.run_data  # noqa: F401
 
 
 @dataclass(slots=True, eq=False)
-class _MotionData:
-    """Data of the motion, as far as it got.
+class _Run:
+    """One run; its methods are in the order of time.
 
     Attributes:
         course: Start of the run; its time is that of the motion once this begins.
@@ -244,16 +209,128 @@ class _MotionData:
         troubles: Missing data, and what a function of the caller raised late, a sentence each.
     """
 
-    course: RunCourse
-    callbacks: Callbacks
-    listener: GuardedListener
+    prepared: PreparedRun
+    folder: RunFolder
+    cameras: Mapping[Camera, str]
+    options: RunOptions
+    commands: Commands
+    course: RunCourse = field(init=False)
+    callbacks: Callbacks = field(init=False)
+    listener: GuardedListener = field(init=False)
     begun: bool = False
     recorder: Recorder | None = None
     outcome: Outcome | None = None
     seen: CameraRecords | None = None
     troubles: list[str] = field(default_factory=list)
 
-    def take_event(self, code: str, text: str, at: float) -> None:
+    def __post_init__(self) -> None:
+        rig, fast = self.prepared.rig, not self.options.realtime
+        interface, simulated = rig.document.bus.interface, is_simulated(rig)
+        self.course = RunCourse(datetime.now(UTC), interface, simulated, fast, versions=versions())
+        self.callbacks = Callbacks(self.commands.board.ask_stop)
+        self.listener = GuardedListener(self.options.listener, self.callbacks)
+
+    def recorded(self) -> RunResult:
+        """Moves and measures, with a run folder."""
+        folder = self.folder
+        try:
+            folder.write_plan(self.prepared.plan.plan.document)
+            folder.write_rig(self.prepared.rig.document)
+            folder.write_course(self.course)
+            with folder.held():
+                self._move_and_measure()
+                result = self.commands.supervisor.conclude(self._conclude)
+        except StoppedByOperator:
+            self.callbacks.leave()
+            raise
+        finally:
+            self._close()
+            if not self.begun:
+                folder.discard()
+        self.callbacks.leave()
+        return result
+
+    def _move_and_measure(self) -> None:
+        """Moves and takes images; a failure of the motion once begun is part of the outcome."""
+        try:
+            self.commands.supervisor.during(self.commands.board, self._with_listeners)
+        except Exception as error:
+            if not self.begun or self.recorder is None:
+                raise
+            text = f"{type(error).__name__}: {error}".rstrip(": ")
+            if self.outcome is None:
+                text = f"the program failed during the motion: {text}"
+                log, started = self.recorder.log, self.course.started
+                self.outcome = Outcome(State.LATCHED, text, log, False, started)
+            else:
+                self.troubles.append(f"writing the results failed: {text}")
+
+    def _with_listeners(self) -> None:
+        """Moves while the command socket accepts requests such as `cdpr stop`."""
+        prepared, options, board = self.prepared, self.options, self.commands.board
+        listener, fast, on_event = self.listener, not options.realtime, options.on_event
+        rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
+        every = cycles_per_image(asked_rate(self.cameras), cycle)
+        status = RunStatus(prepared, self.folder.path, board, simulated_time=fast)
+        opening = partial(open_cameras, prepared, self.cameras, self.folder.path, board)
+        with ExitStack() as stack:
+            stack.enter_context(self.commands.during_motion(status))
+            cameras = stack.enter_context(opening(simulated_time=fast, listener=options.listener))
+            with listener.progress("preparing, row", rows) as show:
+                watch = (
+                    CameraWatch(
+                        cameras, status, board, self._take_event,
+                        clearance_stop=options.clearance_stop, listener=listener,
+                    )
+                    if cameras
+                    else None
+                )  # fmt: skip
+                recorder = self.recorder = Recorder(
+                    prepared,
+                    self.folder,
+                    status,
+                    trigger=watch.trigger if watch else None,
+                    every=every,
+                    progress=lambda row: show(
+                        row, watch.rates if watch else "", f"{recorder.state.value}, row"
+                    ),
+                    announce=listener.note,
+                    on_event=on_event and self.callbacks.guarded("on_event", on_event),
+                    own_thread=options.realtime,
+                )
+                self.outcome = self._move(recorder)
+                status.take_end(self.outcome.state, self.outcome.cause)
+            self.seen = watch.finish(recorder.last) if watch else CameraRecords()
+
+    def _move(self, recorder: Recorder) -> Outcome:
+        """Arms the drives and runs the loop: here in simulated time, else in another process."""
+        prepared, options = self.prepared, self.options
+
+        def before_motion(denied: str) -> None:
+            if denied:
+                recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
+                options.listener.remark(denied)
+            self.course = replace(self.course, started=datetime.now(UTC))
+            recorder.writer.take_file(partial(self.folder.write_course, self.course))
+            self.begun = True
+            self.commands.supervisor.on_motion()
+
+        def mover(motion: PathMotion) -> AbstractContextManager[Mover]:
+            start = options.start or prepared.scene.start
+            return open_mover(
+                prepared.rig,
+                motion,
+                partial(drives_of, prepared.rig.document, start, prepared.scene.load),
+                self.commands.board,
+                SimulatedClock(prepared.checked.table.cycle),
+                need_real_time_rights=options.need_real_time_rights,
+                listener=options.listener,
+                after_stop="run it again when ready",
+            )
+
+        return run_along_path(prepared, mover, recorder, before_motion=before_motion)
+
+    def _take_event(self, code: str, text: str, at: float) -> None:
         """Records an event of another source than the loop.
 
         Raises:
@@ -266,182 +343,54 @@ class _MotionData:
             if self.outcome is None:
                 raise
 
-    def close(self) -> None:
+    def _conclude(self) -> RunResult:
+        """Computes the verdict, reports it, then writes the result files."""
+        outcome, supervisor = self.outcome, self.commands.supervisor
+        assert outcome is not None
+        with self.listener.waiting("evaluating the run"):
+            self._close()  # what is not on record fails the run, as during the motion
+            course = self._course(outcome)
+            evaluated, summary = self._evaluated(outcome, course)
+        result = RunResult(self.folder.path, summary)
+        supervisor.on_verdict(result)
+        with self.listener.waiting("writing the run folder and report"):
+            events, left_out = outcome.log.events, supervisor.leaves_files_out
+            missing = write_end(self.folder, course, evaluated, events, left_out)
+        if self.callbacks.error not in " ".join((course.cause, *course.troubles)):
+            self.listener.warning(f"{self.callbacks.error}; the verdict does not depend on it")
+        has_report = evaluated is not None and REPORT not in missing
+        report = self.folder.report if has_report else None
+        return RunResult(self.folder.path, summary, missing, report)
+
+    def _course(self, outcome: Outcome) -> RunCourse:
+        """The course with the end of the motion."""
+        late = self.callbacks.error
+        if late and (outcome.state is State.STOPPED or late not in outcome.cause):
+            self.troubles.append(late)
+        return replace(
+            self.course,
+            started=outcome.started,
+            final_state=outcome.state.value,
+            cause=outcome.cause,
+            cycles=len(outcome.log),
+            cameras=() if self.seen is None else tuple(self.seen.cameras),
+            troubles=tuple(self.troubles),
+        )
+
+    def _evaluated(
+        self, outcome: Outcome, course: RunCourse
+    ) -> tuple[EvaluatedRun | None, dict[str, Any]]:
+        """The evaluation and its summary; if that fails, a summary without tables."""
+        assert self.recorder is not None
+        try:
+            seen = self.seen or CameraRecords()
+            evaluated = evaluate(self.prepared, outcome, seen, course, self.recorder)
+        except Exception as error:
+            trouble = f"{type(error).__name__}: {error}".rstrip(": ")
+            return None, not_evaluated(self.prepared, outcome, course, trouble)
+        return evaluated, evaluated.summary
+
+    def _close(self) -> None:
         """Waits until all records are on disk."""
         if self.recorder is not None:
             self.recorder.writer.close()
-
-
-def _preload_results() -> None:
-    """Loads modules of the result files now, as a failure after the motion would lose data."""
-    import cv2  # noqa: F401
-    import scipy.spatial  # noqa: F401
-
-    import executor.report.page
-    import executor.report.run_data  # noqa: F401
-
-
-def _move_and_measure(job: _Job, moved: _MotionData) -> None:
-    """Moves and takes images; a failure after the start of motion becomes part of the outcome."""
-    board = job.commands.board
-    try:
-        job.commands.supervisor.during(board, partial(_with_listeners, job, board, moved))
-    except Exception as error:
-        if not moved.begun or moved.recorder is None:
-            raise
-        text = f"{type(error).__name__}: {error}".rstrip(": ")
-        if moved.outcome is None:
-            text = f"the program failed during the motion: {text}"
-            log, started = moved.recorder.log, moved.course.started
-            moved.outcome = Outcome(State.LATCHED, text, log, False, started)
-        else:
-            moved.troubles.append(f"writing the results failed: {text}")
-
-
-def _with_listeners(job: _Job, board: LocalRequests | SharedRequests, moved: _MotionData) -> None:
-    """Moves while the command socket accepts requests such as `cdpr stop`."""
-    prepared, options, on_event = job.prepared, job.options, job.options.on_event
-    listener, fast = moved.listener, not options.realtime
-    rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
-    every = cycles_per_image(asked_rate(job.cameras), cycle)
-    status = RunStatus(prepared, job.folder.path, board, simulated_time=fast)
-    opening = partial(open_cameras, prepared, job.cameras, job.folder.path, board)
-    with ExitStack() as stack:
-        stack.enter_context(job.commands.during_motion(status))
-        cameras = stack.enter_context(opening(simulated_time=fast, listener=options.listener))
-        with listener.progress("preparing, row", rows) as show:
-            watch = (
-                CameraWatch(
-                    cameras, status, board, moved.take_event,
-                    clearance_stop=options.clearance_stop, listener=listener,
-                )
-                if cameras
-                else None
-            )  # fmt: skip
-            recorder = moved.recorder = Recorder(
-                prepared,
-                job.folder,
-                status,
-                trigger=watch.trigger if watch else None,
-                every=every,
-                progress=lambda row: show(
-                    row, watch.rates if watch else "", f"{recorder.state.value}, row"
-                ),
-                announce=listener.note,
-                on_event=on_event and moved.callbacks.guarded("on_event", on_event),
-                own_thread=options.realtime,
-            )
-            moved.outcome = _move(job, board, recorder, moved)
-            status.take_end(moved.outcome.state, moved.outcome.cause)
-        moved.seen = watch.finish(recorder.last) if watch else CameraRecords()
-
-
-def _move(
-    job: _Job, board: LocalRequests | SharedRequests, recorder: Recorder, moved: _MotionData
-) -> Outcome:
-    """Arms the drives and runs the loop: here in simulated time, else in another process."""
-
-    def before_motion() -> None:
-        moved.course = replace(moved.course, started=datetime.now(UTC))
-        recorder.writer.take_file(partial(job.folder.write_course, moved.course))
-        moved.begun = True
-        job.commands.supervisor.on_motion()
-
-    if isinstance(board, SharedRequests):
-        return _move_in_real_time(job, board, recorder, before_motion)
-
-    def confirm_motion() -> None:
-        require_no_stop(board)
-        before_motion()
-
-    prepared = job.prepared
-    start, load = job.options.start or prepared.scene.start, prepared.scene.load
-    with open_drives(prepared.rig, start, load, listener=job.options.listener) as drives:
-        return run_in_process(
-            prepared,
-            drives.group,
-            SimulatedClock(prepared.checked.table.cycle),
-            board,
-            recorder,
-            true_pose=drives.true_pose,
-            carry=drives.carry,
-            before_motion=confirm_motion,
-        )
-
-
-def _move_in_real_time(
-    job: _Job, board: SharedRequests, recorder: Recorder, before_motion: Callable[[], None]
-) -> Outcome:
-    prepared, options = job.prepared, job.options
-
-    def armed(denied: str) -> None:
-        if denied:
-            recorder.take_event(LoopEvent(0, 0.0, "no_real_time", denied))
-            options.listener.remark(denied)
-        before_motion()
-
-    simulated = is_simulated(prepared.rig)
-    if simulated:
-        ready_to_simulate(options.listener, only_missing=True)
-    start, load = options.start or prepared.scene.start, prepared.scene.load
-    return run_in_real_time(
-        prepared,
-        partial(drives_of, prepared.rig.document, start, load),
-        board,
-        recorder,
-        pose_every=recorder.every if simulated else 0,
-        need_real_time=options.need_real_time_rights and not simulated,
-        check_drives=partial(abandoned_drives_fault, prepared.rig.document),
-        before_motion=armed,
-        listener=options.listener,
-    )
-
-
-def _conclude(job: _Job, moved: _MotionData) -> RunResult:
-    """Computes the verdict, reports it, then writes the result files."""
-    outcome, supervisor = moved.outcome, job.commands.supervisor
-    assert outcome is not None
-    with moved.listener.waiting("evaluating the run"):
-        moved.close()  # what is not on record fails the run, as during the motion
-        course = _course(moved, outcome)
-        evaluated, summary = _evaluated(job, moved, outcome, course)
-    result = RunResult(job.folder.path, summary)
-    supervisor.on_verdict(result)
-    with moved.listener.waiting("writing the run folder and report"):
-        events, left_out = outcome.log.events, supervisor.leaves_files_out
-        missing = write_end(job.folder, course, evaluated, events, left_out)
-    if moved.callbacks.error not in " ".join((course.cause, *course.troubles)):
-        moved.listener.warning(f"{moved.callbacks.error}; the verdict does not depend on it")
-    has_report = evaluated is not None and REPORT not in missing
-    report = job.folder.report if has_report else None
-    return RunResult(job.folder.path, summary, missing, report)
-
-
-def _course(moved: _MotionData, outcome: Outcome) -> RunCourse:
-    """The course with the end of the motion."""
-    late = moved.callbacks.error
-    if late and (outcome.state is State.STOPPED or late not in outcome.cause):
-        moved.troubles.append(late)
-    return replace(
-        moved.course,
-        started=outcome.started,
-        final_state=outcome.state.value,
-        cause=outcome.cause,
-        cycles=len(outcome.log),
-        cameras=() if moved.seen is None else tuple(moved.seen.cameras),
-        troubles=tuple(moved.troubles),
-    )
-
-
-def _evaluated(
-    job: _Job, moved: _MotionData, outcome: Outcome, course: RunCourse
-) -> tuple[EvaluatedRun | None, dict[str, Any]]:
-    """The evaluation and its summary; if that fails, a summary without tables."""
-    assert moved.recorder is not None
-    try:
-        seen = moved.seen or CameraRecords()
-        evaluated = evaluate(job.prepared, outcome, seen, course, moved.recorder)
-    except Exception as error:
-        trouble = f"{type(error).__name__}: {error}".rstrip(": ")
-        return None, not_evaluated(job.prepared, outcome, course, trouble)
-    return evaluated, evaluated.summary

@@ -1,4 +1,4 @@
-"""Motions without a planned path: the common part of homing, jogging one cable and jog sessions."""
+"""Where a motion runs, and motions without a planned path: homing, jogging, jog sessions."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
-from executor.control.winch_loop import LawMotion, MakeLaw, WinchesHere, WinchMover
+from executor.control.winch_loop import LawMotion, MakeLaw
 from executor.control.winch_motion import (
     AtRest,
     WinchRecord,
@@ -23,8 +23,9 @@ from executor.interlock.fault_latch import AFTER_A_FAULT
 from executor.interlock.interlock import MotionInterlock
 from executor.kernels import ready_to_simulate
 from executor.realtime.child import MotionTask, ReadyDrives
-from executor.realtime.process import real_time_process
+from executor.realtime.process import MotionHere, Mover, real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
+from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import free_folder
 from executor.remote.command_server import Commands
 from executor.remote.status import WinchStatus
@@ -152,6 +153,47 @@ def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) ->
 
 
 @contextmanager
+def open_mover(
+    rig: Rig,
+    task: MotionTask,
+    make_drives: Callable[..., AbstractContextManager[ReadyDrives]],
+    board: LocalRequests | SharedRequests,
+    clock: Clock,
+    *,
+    need_real_time_rights: bool,
+    listener: Listener,
+    after_stop: str = "",
+) -> Iterator[Mover]:
+    """Opens the drives of a motion: here in simulated time, else in the real-time process.
+
+    Args:
+        make_drives: Opens them; takes a `listener` where it is called in this process.
+        board: Local in simulated time.
+        clock: Of simulated time.
+        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
+        after_stop: As for `MotionHere`.
+    """
+    if isinstance(board, LocalRequests):
+        try:
+            with make_drives(listener=listener) as drives:
+                yield MotionHere(task, drives, clock, board, after_stop)
+        finally:
+            task.close()
+        return
+    if simulated := is_simulated(rig):
+        ready_to_simulate(listener, only_missing=True)
+    with real_time_process(
+        task,
+        make_drives,
+        board,
+        need_real_time=need_real_time_rights and not simulated,
+        check_drives=partial(abandoned_drives_fault, rig.document),
+        listener=listener,
+    ) as process:
+        yield process
+
+
+@contextmanager
 def _progress(listener: Listener) -> Iterator[Callable[[CycleRecord], None]]:
     """Shows the progress of a law, which is the record's index."""
     with listener.progress("moving, %", 100.0) as advance:
@@ -184,35 +226,29 @@ def move_supervised(
 
     Args:
         commands: Those taken since the start of the verb.
-        make_drives: Opens them; takes a `listener` where it is called in this process.
+        make_drives: See `open_mover`.
         status: Answers on the command socket.
         name: Of the record folder in ``runs``; simulated drives leave none.
-        need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         showing: Called after every cycle, before the status.
         presses: Where the command socket writes held controls.
         unreported: Codes of events that the listener does not get.
         rehome: The drives are referenced again afterwards.
         at_rest: See `AtRest`.
     """
-    interlock, board, simulated = MotionInterlock(rig), commands.board, is_simulated(rig)
+    interlock, simulated = MotionInterlock(rig), is_simulated(rig)
     with ExitStack() as stack:
         stack.enter_context(commands.during_motion(status, presses))
-        moving: WinchMover
-        if isinstance(board, LocalRequests):
-            drives = stack.enter_context(make_drives(listener=listener))
-            moving = WinchesHere(task, drives, clock, board)
-        else:
-            if simulated:
-                ready_to_simulate(listener, only_missing=True)
-            process = real_time_process(
+        moving = stack.enter_context(
+            open_mover(
+                rig,
                 task,
                 make_drives,
-                board,
-                need_real_time=need_real_time_rights and not simulated,
-                check_drives=partial(abandoned_drives_fault, rig.document),
+                commands.board,
+                clock,
+                need_real_time_rights=need_real_time_rights,
                 listener=listener,
             )
-            moving = stack.enter_context(process)
+        )
         log = stack.enter_context(nullcontext() if simulated else recording(free_folder(name)))
         if log is not None:
             status.take_folder(log.folder)

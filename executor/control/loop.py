@@ -36,12 +36,21 @@ GONE = 10
 
 
 class Loop:
-    """One run of checked set-points on one drive group."""
+    """One run of checked set-points on one drive group.
+
+    A subclass is another motion. It overrides `_follow`, `_index` and the class attributes, and
+    uses `_send`, `_handle_alarms` and `_report`; `_feed`, which it may replace; `_sender`, for the
+    targets at rest and the range that the gate allows; and `_press`. It reports AT_REST to
+    `machine`; no other event. `_send` and `_handle_alarms` return after a fault only once the
+    drives were stopped and drained: while `machine.state` is as before, there was none.
+    """
 
     motion_phrase = "along the path"
     """How the drives move and stop, in messages."""
     slack_counts = True
     """A slack cable is a fault."""
+    takes_feed_requests = True
+    """The operator may request a feed hold and a speed, not only a stop."""
 
     def __init__(
         self, checked: CheckedSetpoints, master: SyncMaster, calls: SupervisorCalls
@@ -299,7 +308,13 @@ class Loop:
     def _apply_requests(self, requests: OperatorRequests) -> None:
         """Applies the operator's requests as far as the state allows."""
         state = self.machine.state
-        if self._apply_stop(requests):
+        if requests.stop and state in _STOPPABLE:
+            why = requests.for_what or StopReason("stop", "stop requested")
+            self._requested = f"{why.text}; {self._slow_down()}"
+            self._report_cause(why.code, self._requested)
+            self.machine.on(Event.STOP)
+            return
+        if not self.takes_feed_requests:
             return
         speed = f"{requests.speed:.0%} of the planned speed"
         if requests.hold and state is State.MOVING:
@@ -312,16 +327,6 @@ class Loop:
         elif state is State.MOVING and self._feed.wanted != requests.speed:
             self._feed.go_to(requests.speed)
             self._report("speed", f"speed {self.motion_phrase}: {speed}")
-
-    def _apply_stop(self, requests: OperatorRequests) -> bool:
-        """Begins a path stop if one is requested and possible; returns whether it did."""
-        if not (requests.stop and self.machine.state in _STOPPABLE):
-            return False
-        why = requests.for_what or StopReason("stop", "stop requested")
-        self._requested = f"{why.text}; {self._slow_down()}"
-        self._report_cause(why.code, self._requested)
-        self.machine.on(Event.STOP)
-        return True
 
     def _slow_down(self) -> str:
         """Stops the feed; returns what follows."""
@@ -413,14 +418,10 @@ class Loop:
         self._bus_faults = 0
         if done.verdict.allowed:
             self._record(done)
-            self._report_reasons(done.alarms)
+            for alarm in done.alarms:  # drive faults may arrive after the cause of the stop
+                if alarm.code == "drive_fault" and alarm.text not in self.cause:
+                    self._report_once(alarm)
         return done.verdict.allowed
-
-    def _report_reasons(self, alarms: tuple[Alarm, ...]) -> None:
-        """Reports drive faults that arrive after the cause of the stop."""
-        for alarm in alarms:
-            if alarm.code == "drive_fault" and alarm.text not in self.cause:
-                self._report_once(alarm)
 
     def _report_cause(self, code: str, text: str) -> None:
         """Reports why the run does not finish."""

@@ -1,33 +1,32 @@
-"""Motions along a checked path: in this process, or in the real-time process."""
+"""Motions along a checked path."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 
 import numpy as np
 
-from drivers.drive_group import CycleStatus, DriveGroup
+from drivers.drive_group import CycleStatus
 from drivers.factory import without_torque
 from executor.control.loop import Loop
 from executor.control.preconditions import require_still_referenced
 from executor.control.sync_master import SyncMaster
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
-from executor.realtime.child import MakeDrives, MotionTask, ReadyDrives
-from executor.realtime.process import CheckDrives, real_time_process
-from executor.realtime.scheduling import Clock
-from executor.realtime.shared_memory import SharedMemory, SharedRequests
+from executor.realtime.child import MotionTask, ReadyDrives
+from executor.realtime.process import Mover
+from executor.realtime.shared_memory import SharedMemory
 from executor.recording.recorder import Recorder, RunLog
-from executor.state_machine import ON_PATH, CycleRecord, State
-from executor.supervision import RequestBoard, SupervisorCalls
+from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
+from executor.supervision import SupervisorCalls
 from executor.trajectory.dwell import Schedule, load_changes
 from executor.trajectory.setpoints import CheckedSetpoints, PreparedRun, checked_setpoints_of
 from model.errors import CdprError
 from model.files.rig_file import RigDocument
 from model.pose import Pose
-from model.progress import SILENT, Listener
 from model.rig import rig_from_document
 from model.scene import Load
 
@@ -100,7 +99,7 @@ class PathMotion(MotionTask):
         self.setpoints.close()
 
 
-# A motion from arming to the end, in this process.
+# A motion from arming to the end.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,99 +121,36 @@ class Outcome:
     started: datetime
 
 
-def run_in_process(
+def run_along_path(
     prepared: PreparedRun,
-    group: DriveGroup,
-    clock: Clock,
-    board: RequestBoard,
+    open_mover: Callable[[PathMotion], AbstractContextManager[Mover]],
     recorder: Recorder,
     *,
-    true_pose: Callable[[], Pose] | None,
-    carry: Callable[[Load], None],
-    before_motion: Callable[[], None],
-) -> Outcome:
-    """Moves along the path in simulated time; ends with the drives holding on their own.
-
-    Args:
-        recorder: Records cycles and events.
-        true_pose: Returns the true pose of the simulated platform.
-        carry: Changes the payload of the simulated platform.
-        before_motion: Called when armed; an exception prevents the motion.
-
-    Raises:
-        Refused: Arming was refused; nothing was enabled.
-        HardwareMissing: A drive does not answer.
-    """
-    loads = load_changes(prepared.scene, prepared.checked.table.dwells)
-
-    def on_cycle(record: CycleRecord) -> None:
-        if record.state in ON_PATH:
-            for load in loads.due(record.index):
-                carry(load)
-        wanted = true_pose is not None and recorder.wants_pose(record.cycle)
-        recorder.take_cycle(record, true_pose() if wanted and true_pose else None)
-
-    loop = Loop(
-        checked_setpoints_of(prepared.checked),
-        SyncMaster(prepared.rig, group, clock),
-        SupervisorCalls(board.read, on_cycle, recorder.take_event),
-    )
-    loop.arm()
-    before_motion()
-    started = datetime.now(UTC)
-    loop.run()
-    return Outcome(loop.machine.state, loop.cause, recorder.log, loop.holding, started)
-
-
-# In the real-time process, from arming to the end.
-
-
-def run_in_real_time(
-    prepared: PreparedRun,
-    make_drives: MakeDrives,
-    board: SharedRequests,
-    recorder: Recorder,
-    *,
-    pose_every: int,
-    need_real_time: bool,
-    check_drives: CheckDrives,
     before_motion: Callable[[str], None],
-    listener: Listener = SILENT,
 ) -> Outcome:
-    """Moves along the path in the real-time process; ends with the drives holding.
+    """Moves along the path; ends with the drives holding on their own.
 
     Args:
-        make_drives: Opens and configures the drives; called in that process; picklable.
+        open_mover: Opens the drives for a motion; see `executor.winch_runs.open_mover`.
         recorder: Records cycles and events.
-        pose_every: Cycles between true poses of the simulated platform; 0 for none.
-        need_real_time: Refuse to arm when the system denies real-time scheduling.
-        check_drives: As for `executor.realtime.process.real_time_process`.
         before_motion: Called when armed, with what the system denied; an exception prevents the
             motion.
-        listener: Receives remarks on missing capabilities of the drives.
 
     Raises:
-        CdprError: The bus is latched, or the process could not arm the drives, as stated;
-            nothing was enabled.
+        CdprError: The bus is latched, or the drives could not be armed, as stated; nothing was
+            enabled.
         StoppedByOperator: A stop was requested before anything moved.
     """
     interlock = MotionInterlock(prepared.rig)
     reference = interlock.require_ready()
     motion = PathMotion.of(
         checked_setpoints_of(prepared.checked),
-        pose_every=pose_every,
+        pose_every=recorder.pose_every,
         loads=load_changes(prepared.scene, prepared.checked.table.dwells),
         reference=reference,
     )
-    with real_time_process(
-        motion,
-        make_drives,
-        board,
-        need_real_time=need_real_time,
-        check_drives=check_drives,
-        listener=listener,
-    ) as process:
-        armed = process.arm(recorder)
+    with open_mover(motion) as mover:
+        armed = mover.arm(recorder)
         interlock.begin(recorder.folder.path, reference)
         try:
             before_motion(armed.denied)
@@ -222,7 +158,7 @@ def run_in_real_time(
             interlock.cancel()
             raise
         started = datetime.now(UTC)
-        ended = process.run()
+        ended = mover.run()
         last = recorder.log.last
         try:
             interlock.end(
@@ -235,6 +171,7 @@ def run_in_real_time(
             )
         except CdprError as error:  # the motion is over: its record is still completed
             text = f"{error.what} ({error.where}: {error.why})"
-            process.report_event("recorder", text)
+            with suppress(CdprError):  # a full disk must not change the outcome
+                recorder.take_event(LoopEvent(0, last.at if last else 0.0, "recorder", text))
             return Outcome(State.LATCHED, ended.cause or text, recorder.log, ended.holding, started)
         return Outcome(ended.state, ended.cause, recorder.log, ended.holding, started)

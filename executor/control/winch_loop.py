@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Protocol
 
 import numpy as np
 
@@ -20,13 +18,12 @@ from executor.control.loop import Loop
 from executor.control.preconditions import with_reduced_limits
 from executor.control.sync_master import SyncMaster
 from executor.control.winch_laws import WinchLaw
-from executor.realtime.child import Armed, Ended, MotionTask, Procedure, ReadyDrives, Records
-from executor.realtime.scheduling import Clock
+from executor.realtime.child import MotionTask, ReadyDrives
 from executor.safety.gate import Purpose
 from executor.state_machine import Event, State
-from executor.supervision import RequestBoard, SupervisorCalls
+from executor.supervision import SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
-from model.errors import Refused, StoppedByOperator
+from model.errors import Refused
 from model.rig import Rig
 from model.winches import WinchMap
 
@@ -71,28 +68,11 @@ class WinchLoop(Loop):
         return 100.0 * self._law.progress
 
 
-# Winch motion in the real-time process, or in simulated time in this one.
+# Its task, for the real-time process or for simulated time in this one.
 
 
 #: Makes a law from the referenced rig with reduced limits and the drive positions [counts].
 MakeLaw = Callable[[Rig, Sequence[int]], WinchLaw]
-
-
-class WinchMover(Protocol):
-    """Arms the drives, moves them, and reads their status afterwards."""
-
-    def arm(self, records: Records) -> Armed:
-        """Prepares the motion; events from now on go to the records.
-
-        Raises:
-            CdprError: Arming failed; nothing was enabled.
-        """
-
-    def run(self) -> Ended:
-        """Moves; the drives hold on their own at the end."""
-
-    def read_status(self) -> CycleStatus:
-        """Status of the drives after the motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,47 +116,3 @@ def _require_reach_allowed(rig: Rig, law: WinchLaw) -> None:
                 next_step="allow a shorter reach or length, or take a pose farther inside the"
                 " workspace box; nothing was enabled",
             )
-
-
-class WinchesHere:
-    """Moves winches in this process, in simulated time; a `WinchMover`."""
-
-    def __init__(
-        self, motion: MotionTask, drives: ReadyDrives, clock: Clock, board: RequestBoard
-    ) -> None:
-        self._motion, self._drives, self._board = motion, drives, board
-        self._master = SyncMaster(drives.rig, drives.group, clock)
-        self._loop: Procedure | None = None
-
-    def arm(self, records: Records) -> Armed:
-        """See `WinchMover`.
-
-        Raises:
-            CdprError: The drives cannot be armed.
-            StoppedByOperator: A stop was requested before anything moved.
-        """
-        calls = SupervisorCalls(
-            requests=self._board.read,
-            on_cycle=lambda record: records.take_cycle(record, None),
-            on_event=records.take_event,
-        )
-        self._loop = self._motion.loop(self._drives, self._master, calls)
-        self._loop.arm(partial(self._motion.require, self._drives))
-        if self._board.read().stop:
-            raise StoppedByOperator("stopped before anything moved")
-        return Armed("", self._loop.positions)
-
-    def run(self) -> Ended:
-        """See `WinchMover`.
-
-        Raises:
-            Refused: It was not armed.
-        """
-        if self._loop is None:
-            raise Refused("the motion was not armed", where="executor")
-        state = self._loop.run()
-        return Ended(state, self._loop.cause, self._loop.holding, self._drives.true_pose_now())
-
-    def read_status(self) -> CycleStatus:
-        """See `WinchMover`."""
-        return self._master.read_state()

@@ -18,11 +18,11 @@ import numpy as np
 from drivers.drive_group import CycleStatus
 from drivers.factory import may_have_released, without_torque
 from executor.control.cycle import SETTLING
-from executor.control.winch_loop import WinchMover
 from executor.interlock.fault_latch import AFTER_A_FAULT
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.realtime.child import Armed, Ended, Records
+from executor.realtime.process import Mover
 from executor.recording.run_folder import EVENTS
 from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import BadInput, CdprError, Fault
@@ -119,7 +119,7 @@ class _LastCycles:
 
 
 def move_winches(
-    mover: WinchMover,
+    mover: Mover,
     rig: Rig,
     interlock: MotionInterlock,
     records: Records,

@@ -26,12 +26,12 @@ from executor.control.winch_laws import (
     TensionReserve,
     tension_reserve,
 )
-from executor.hold_to_run.presses import CablePress, Press, PressReader, PressState
+from executor.hold_to_run.presses import CableMove, Press, PressReader, PressState
 from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import CycleRecord, Event, State
-from executor.supervision import OperatorRequests, SupervisorCalls
+from executor.supervision import SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, fingerprint
 from model.rig import Rig
 from model.winches import WinchMap
@@ -78,6 +78,7 @@ class CableLoop(Loop):
 
     motion_phrase = "together"
     slack_counts = False
+    takes_feed_requests = False  # the held control sets hold and speed
 
     def __init__(
         self,
@@ -184,10 +185,6 @@ class CableLoop(Loop):
         moved = self._sender.resting_targets[self._cable] - self._from
         return 1000.0 * moved / self._rig.winches[self._cable].counts_per_metre
 
-    def _apply_requests(self, requests: OperatorRequests) -> None:
-        """Applies only a stop: the held control sets hold and speed."""
-        self._apply_stop(requests)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CableMotion(MotionTask):
@@ -277,7 +274,7 @@ class CableTravel:
         moved = np.flatnonzero(np.not_equal(record.targets, self._targets))
         if moved.size:
             self.cable = int(moved[0]) + 1
-        elif isinstance(press, CablePress) and record.rate == 0.0:
-            self.cable = press.cable
+        elif press is not None and isinstance(press.move, CableMove) and record.rate == 0.0:
+            self.cable = press.move.cable
         self._targets, self.by_press = record.targets, record.index / 1000.0
         self._tensions = self._rig.tensions_by(record.torques).tolist()

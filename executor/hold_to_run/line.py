@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from executor.hold_to_run.presses import PlatformPress, PressBoard
+from executor.hold_to_run.presses import PlatformMove, Press, PressBoard
 from executor.realtime.shared_memory import Ring, SharedMemory
 from executor.state_machine import ON_PATH, CycleRecord, State
 from executor.trajectory.path import Path, line
@@ -228,24 +228,25 @@ class JogProver:
             self._followed = self._line
         self._row = record.index  # on the line that the loop follows
         press = self._board.held()
-        if record.state is not State.MOVING or not isinstance(press, PlatformPress):
+        is_moving = record.state is State.MOVING
+        if not is_moving or press is None or not isinstance(press.move, PlatformMove):
             return
         if press.number != self._press:
             # The motion of this cycle was decided up to one cycle before it began.
             if record.rate == 0.0 and record.at - press.free_since > CERTAIN * self._cycle:
-                self._begin(press)
+                self._begin(press, press.move)
         elif not self._is_whole and self._line.rows - 1 - self._row_on_line < self._wanted_rows:
             self._check(press)
 
-    def _begin(self, press: PlatformPress) -> None:
+    def _begin(self, press: Press, move: PlatformMove) -> None:
         start = self.pose
-        rotation = start.rotation if press.in_platform else np.eye(3)
-        self._line = JogLine(self._rig, self._scene, start, rotation @ press.direction)
+        rotation = start.rotation if move.in_platform else np.eye(3)
+        self._line = JogLine(self._rig, self._scene, start, rotation @ move.direction)
         self._press, self.limit = press.number, ""
         self._size, self._narrows, self._is_whole = FIRST_ROWS, False, False
         self._check(press)
 
-    def _check(self, press: PlatformPress) -> None:
+    def _check(self, press: Press) -> None:
         """Checks the next piece; halves it when refused, until no row is left."""
         first = self._line.rows - 1
         try:

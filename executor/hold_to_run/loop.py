@@ -23,7 +23,7 @@ from executor.realtime.child import MotionTask, ReadyDrives
 from executor.realtime.shared_memory import SharedMemory
 from executor.safety.gate import Purpose
 from executor.state_machine import Event, State
-from executor.supervision import OperatorRequests, SupervisorCalls
+from executor.supervision import SupervisorCalls
 from executor.trajectory.setpoints import CheckedSetpoints, Setpoints, fingerprint
 from model.errors import Fault
 from model.files.rig_file import RigDocument
@@ -39,6 +39,7 @@ class JogLoop(Loop):
     """One session of jogs on one drive group."""
 
     motion_phrase = "along the jog"
+    takes_feed_requests = False  # the held control sets hold and speed
 
     def __init__(
         self,
@@ -124,10 +125,6 @@ class JogLoop(Loop):
         self._feed = Feed(len(self._rows), self._checked.cycle, motion, rate=rate)
         self._sender.index = 0.0
         self._sender.allow(self._rows)
-
-    def _apply_requests(self, requests: OperatorRequests) -> None:
-        """Applies only a stop: the held control sets hold and speed."""
-        self._apply_stop(requests)
 
 
 def _meet(row: Setpoints, others: Sequence[int]) -> bool:

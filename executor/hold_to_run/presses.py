@@ -79,22 +79,7 @@ class PressState:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Press:
-    """Command of a press; constant while it lasts.
-
-    Attributes:
-        number: From 1, rising.
-        step: Length of a jog that ends on its own, [m]; None to move while it is held.
-        free_since: Time since which no earlier press was held, [s].
-    """
-
-    number: int
-    step: float | None
-    free_since: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlatformPress(Press):
+class PlatformMove:
     """Moves the platform in a straight line.
 
     Attributes:
@@ -106,8 +91,8 @@ class PlatformPress(Press):
     in_platform: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CablePress(Press):
+@dataclass(frozen=True, slots=True)
+class CableMove:
     """Moves one winch alone.
 
     Attributes:
@@ -117,6 +102,23 @@ class CablePress(Press):
 
     cable: int
     pays_out: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Press:
+    """Command of a press; constant while it lasts.
+
+    Attributes:
+        number: From 1, rising.
+        move: What it moves.
+        step: Length of a jog that ends on its own, [m]; None to move while it is held.
+        free_since: Time since which no earlier press was held, [s].
+    """
+
+    number: int
+    move: PlatformMove | CableMove
+    step: float | None
+    free_since: float
 
 
 class PressBoard:
@@ -141,69 +143,30 @@ class PressBoard:
     def hold(
         self,
         number: int,
-        direction: Array,
+        move: PlatformMove | CableMove,
         *,
-        in_platform: bool,
         step: float | None,
         percent: int,
         age: float = 0.0,
     ) -> bool:
-        """Reports a held control that moves the platform; returns False if that press is over.
+        """Reports a held control; continues its press, begins a new one, or returns False if over.
 
         Args:
-            direction: Unit vector, shape (3,); taken at the beginning of a press.
-            in_platform: See `PlatformPress`.
+            move: Taken at the beginning of a press, like the step.
             step: See `Press`, [m].
             percent: Of the jog speed, from 1 to 100.
             age: Of the report, [s].
 
         Raises:
-            ValueError: The session moves one cable at a time.
+            ValueError: There is no such cable, or the session moves the other kind.
         """
-        if self._cables:
-            raise ValueError("this session moves one cable at a time: name cable and sense")
-        return self._hold(
-            number,
-            percent,
-            age,
-            lambda free_since: PlatformPress(number, step, free_since, direction, in_platform),
-        )
-
-    def hold_cable(
-        self,
-        number: int,
-        cable: int,
-        *,
-        pays_out: bool,
-        step: float | None,
-        percent: int,
-        age: float = 0.0,
-    ) -> bool:
-        """Reports a held control that moves one winch; returns False if that press is over.
-
-        Args:
-            cable: Its number, from 1; taken at the beginning of a press, like the next two.
-            pays_out: See `CablePress`.
-            step: See `Press`, [m].
-            percent: Of the jog speed, from 1 to 100.
-            age: Of the report, [s].
-
-        Raises:
-            ValueError: There is no such cable, or the session moves the platform.
-        """
-        if not self._cables:
-            raise ValueError("this session moves the platform: name a direction")
-        if not 1 <= cable <= self._cables:
-            raise ValueError(f"there is no cable {cable}: name one from 1 to {self._cables}")
-        return self._hold(
-            number,
-            percent,
-            age,
-            lambda free_since: CablePress(number, step, free_since, cable, pays_out),
-        )
-
-    def _hold(self, number: int, percent: int, age: float, begin: Callable[[float], Press]) -> bool:
-        """Continues a press, or begins a new one; returns False if it is over."""
+        match move:
+            case PlatformMove() if self._cables:
+                raise ValueError("this session moves one cable at a time: name cable and sense")
+            case CableMove() if not self._cables:
+                raise ValueError("this session moves the platform: name a direction")
+            case CableMove(cable=cable) if not 1 <= cable <= self._cables:
+                raise ValueError(f"there is no cable {cable}: name one from 1 to {self._cables}")
         with self._lock:
             now = self._now()
             heard = now - age
@@ -214,7 +177,7 @@ class PressBoard:
                 return False
             if not known:
                 self._end_press(now)
-                self._press = begin(self._free_since)
+                self._press = Press(number, move, step, self._free_since)
             self._heard = max(heard, self._heard) if known else heard
             self._percent, self.last_heard = percent, now
             self._write()
@@ -260,8 +223,8 @@ class PressBoard:
         number = 0 if press is None else press.number
         step = math.nan if press is None or press.step is None else press.step
         cable, pays_out = 0, False
-        if isinstance(press, CablePress):
-            cable, pays_out = press.cable, press.pays_out
+        if press is not None and isinstance(press.move, CableMove):
+            cable, pays_out = press.move.cable, press.move.pays_out
         entry = _ENTRY.pack(number, self._heard, self._percent, self._ends, cable, pays_out, step)
         self.memory.view[:_SIZE] = entry + _CHECK.pack(zlib.crc32(entry))
 

@@ -1,4 +1,8 @@
-"""The supervisor's side of the real-time process: starts it, reads its records, sends requests."""
+"""Motions as their supervisor sees them: in the real-time process, or in this one.
+
+In real time it starts the process, reads its records and sends requests; in simulated time the
+loop runs here.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,12 @@ from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing.connection import wait
+from typing import Protocol
 
 from drivers.can_errors import BusFault
 from drivers.drive_group import CycleStatus
 from drivers.factory import shows_no_torque
+from executor.control.sync_master import SyncMaster
 from executor.realtime.child import (
     CYCLE_SLOTS,
     EVENT_SLOTS,
@@ -22,14 +28,22 @@ from executor.realtime.child import (
     Job,
     MakeDrives,
     MotionTask,
+    Procedure,
     ReadDrives,
+    ReadyDrives,
     Records,
     serve,
 )
-from executor.realtime.scheduling import ended_at_start, exit_text, interrupts_blocked, one_thread
+from executor.realtime.scheduling import (
+    Clock,
+    ended_at_start,
+    exit_text,
+    interrupts_blocked,
+    one_thread,
+)
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests, unpack_event
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
-from executor.supervision import record_failure
+from executor.supervision import RequestBoard, SupervisorCalls, record_failure
 from model.errors import CdprError, Fault, HardwareMissing, Refused, StoppedByOperator
 from model.progress import SILENT, Listener
 
@@ -42,6 +56,69 @@ SILENT_POLLS = 300
 END_TIMEOUT = 10.0
 
 CheckDrives = Callable[[Collection[int]], str]
+
+
+class Mover(Protocol):
+    """Arms the drives, moves them, and reads their status afterwards."""
+
+    def arm(self, records: Records) -> Armed:
+        """Prepares the motion; events from now on go to the records.
+
+        Raises:
+            CdprError: Arming failed, or a stop was requested; nothing was enabled.
+        """
+
+    def run(self) -> Ended:
+        """Moves; the drives hold on their own at the end."""
+
+    def read_status(self) -> CycleStatus:
+        """Status of the drives after the motion."""
+
+
+class MotionHere:
+    """Moves drives in this process, in simulated time; a `Mover`."""
+
+    def __init__(
+        self,
+        motion: MotionTask,
+        drives: ReadyDrives,
+        clock: Clock,
+        board: RequestBoard,
+        after_stop: str = "",
+    ) -> None:
+        """Sends nothing yet; ``after_stop`` is the next step if stopped before anything moved."""
+        self._motion, self._drives, self._board = motion, drives, board
+        self._master = SyncMaster(drives.rig, drives.group, clock)
+        self._after_stop = after_stop
+        self._loop: Procedure | None = None
+
+    def arm(self, records: Records) -> Armed:
+        """See `Mover`."""
+
+        def on_cycle(record: CycleRecord) -> None:
+            records.take_cycle(record, self._motion.after(record, self._drives))
+
+        calls = SupervisorCalls(self._board.read, on_cycle, records.take_event)
+        self._loop = self._motion.loop(self._drives, self._master, calls)
+        self._loop.arm(partial(self._motion.require, self._drives))
+        if self._board.read().stop:
+            raise StoppedByOperator("stopped before anything moved", next_step=self._after_stop)
+        return Armed("", self._loop.positions)
+
+    def run(self) -> Ended:
+        """See `Mover`.
+
+        Raises:
+            Refused: It was not armed.
+        """
+        if self._loop is None:
+            raise Refused("the motion was not armed", where="executor")
+        state = self._loop.run()
+        return Ended(state, self._loop.cause, self._loop.holding, self._drives.true_pose_now())
+
+    def read_status(self) -> CycleStatus:
+        """See `Mover`."""
+        return self._master.read_state()
 
 
 @contextmanager
@@ -82,7 +159,7 @@ def _event_code(error: CdprError) -> str:
 
 
 class RealTimeProcess:
-    """One motion in a process of its own; a `WinchMover`."""
+    """One motion in a process of its own; a `Mover`."""
 
     def __init__(
         self, job: Job, board: SharedRequests, check_drives: CheckDrives, listener: Listener

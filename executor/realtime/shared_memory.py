@@ -12,8 +12,10 @@ import time
 import zlib
 from collections.abc import Iterator
 from dataclasses import asdict, replace
+from itertools import chain, islice
 from multiprocessing.reduction import DupFd
-from typing import Protocol
+from operator import attrgetter
+from typing import Any, Protocol
 
 from executor.state_machine import CycleRecord, LoopEvent, State
 from executor.supervision import OperatorRequests, StopReason
@@ -152,6 +154,13 @@ def _checksum(number: int, content: bytes) -> int:
 _STATES = tuple(State)
 _NUMBERS = {state: number for number, state in enumerate(_STATES)}
 _NO_POSE = (math.nan,) * 7
+#: Fields of a record after its state, as in the layout: a value each, then one per drive each.
+_SCALARS = (
+    "cycle", "at", "index", "rate", "missing", "rejected", "error_frames", "following_error",
+    "lateness", "press",
+)  # fmt: skip
+_PER_DRIVE = ("targets", "actual", "torques", "words", "tension_known")
+_scalars_of, _rows_of = attrgetter(*_SCALARS), attrgetter(*_PER_DRIVE)
 
 
 class CycleRecordCodec:
@@ -163,59 +172,24 @@ class CycleRecordCodec:
 
     def __init__(self, cables: int) -> None:
         self._cables = cables
-        self._layout = struct.Struct(f"<Qd B dd HQQ ddQ {4 * cables}i {cables}? 7d")
+        self._layout = struct.Struct(f"<B Qd dd HQQ ddQ {4 * cables}i {cables}? 7d")
         self.size = self._layout.size
 
     def pack(self, record: CycleRecord, pose: Pose | None) -> bytes:
         """Encodes a record, and the simulated platform's pose if known."""
         pose_values = (*pose.position, *pose.quaternion) if pose is not None else _NO_POSE
-        return self._layout.pack(
-            record.cycle,
-            record.at,
-            _NUMBERS[record.state],
-            record.index,
-            record.rate,
-            record.missing,
-            record.rejected,
-            record.error_frames,
-            record.following_error,
-            record.lateness,
-            record.press,
-            *record.targets,
-            *record.actual,
-            *record.torques,
-            *record.words,
-            *record.tension_known,
-            *pose_values,
-        )
+        per_drive = chain.from_iterable(_rows_of(record))
+        state = _NUMBERS[record.state]
+        return self._layout.pack(state, *_scalars_of(record), *per_drive, *pose_values)
 
     def unpack(self, content: bytes) -> tuple[CycleRecord, Pose | None]:
         """The inverse of `pack`."""
-        values = self._layout.unpack(content)
-        cycle, at, state, index, rate, missing, rejected, error_frames = values[:8]
-        error, lateness, press = values[8:11]
-        m = self._cables
-        per_drive = [values[11 + k * m : 11 + (k + 1) * m] for k in range(5)]
-        targets, actual, torques, words, tension_known = per_drive
-        pose_values = values[11 + 5 * m :]
-        record = CycleRecord(
-            cycle=cycle,
-            at=at,
-            state=_STATES[state],
-            index=index,
-            rate=rate,
-            targets=targets,
-            actual=actual,
-            torques=torques,
-            words=words,
-            missing=missing,
-            rejected=rejected,
-            error_frames=error_frames,
-            following_error=error,
-            lateness=lateness,
-            tension_known=tension_known,
-            press=press,
-        )
+        values = iter(self._layout.unpack(content))
+        state = _STATES[next(values)]
+        scalars = {name: next(values) for name in _SCALARS}
+        rows: dict[str, Any] = {name: tuple(islice(values, self._cables)) for name in _PER_DRIVE}
+        record = CycleRecord(state=state, **scalars, **rows)
+        pose_values = tuple(values)
         if math.isnan(pose_values[0]):
             return record, None
         return record, Pose.from_quaternion(pose_values[:3], pose_values[3:])

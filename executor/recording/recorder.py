@@ -394,9 +394,10 @@ class Recorder:
         self.state = State.READY
         """State of the run then."""
 
-    def wants_pose(self, cycle: int) -> bool:
-        """Whether an image will be requested in this cycle."""
-        return self._trigger is not None and cycle % self.every == 0
+    @property
+    def pose_every(self) -> int:
+        """Cycles between true poses that an image needs; 0 without images."""
+        return 0 if self._trigger is None else self.every
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
         """Records a cycle.

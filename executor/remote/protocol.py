@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, Protocol, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
-from executor.hold_to_run.presses import PressBoard
+from executor.hold_to_run.presses import CableMove, PlatformMove, PressBoard
 from executor.supervision import FASTEST, SLOWEST, RequestBoard
 
 
@@ -207,23 +207,16 @@ def _jog(command: JogCommand, presses: PressBoard | None) -> None:
 
 
 def _hold(command: HeldCommand, presses: PressBoard) -> bool:
-    step = None if command.step_mm is None else command.step_mm / 1000.0
-    age = command.age_ms / 1000.0
+    move: PlatformMove | CableMove
     if command.cable is not None:
-        return presses.hold_cable(
-            command.press,
-            command.cable,
-            pays_out=command.sense == "pay_out",
-            step=step,
-            percent=command.percent,
-            age=age,
-        )
-    direction = np.array(command.direction, dtype=np.float64)
+        move = CableMove(command.cable, command.sense == "pay_out")
+    else:
+        direction = np.array(command.direction, dtype=np.float64)
+        move = PlatformMove(direction / np.linalg.norm(direction), command.frame == "platform")
     return presses.hold(
         command.press,
-        direction / np.linalg.norm(direction),
-        in_platform=command.frame == "platform",
-        step=step,
+        move,
+        step=None if command.step_mm is None else command.step_mm / 1000.0,
         percent=command.percent,
-        age=age,
+        age=command.age_ms / 1000.0,
     )

@@ -16,7 +16,7 @@ from executor.control import winch_laws
 from executor.control.winch_laws import tension_reserve
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.cables import CableLimits, CableTravel
-from executor.hold_to_run.presses import TIMEOUT, CablePress, PressBoard, PressState
+from executor.hold_to_run.presses import TIMEOUT, CableMove, Press, PressBoard, PressState
 from executor.hold_to_run.session import cable_session
 from executor.jogging import with_speed
 from executor.remote.protocol import STEPS_MM
@@ -72,7 +72,8 @@ class Script:
 
 
 def hold(number: int, cable: int, out: bool, step: float | None = None, percent: int = 100) -> Say:
-    return lambda board: board.hold_cable(number, cable, pays_out=out, step=step, percent=percent)
+    move = CableMove(cable, pays_out=out)
+    return lambda board: board.hold(number, move, step=step, percent=percent)
 
 
 def moved(records: list[CycleRecord], robot: Rig) -> Array:
@@ -347,7 +348,7 @@ def test_what_keeps_a_cable_from_continuing_is_reported() -> None:
     assert (travel.cable, travel.limit, travel.by_session) == (0, "", [0.0] * 8)
     easy, tight, slack = [20.0] * 8, [20.0] * 8, [20.0] * 8
     tight[5], slack[6] = 55.0, 3.0
-    press = CablePress(1, None, 0.0, 3, False)
+    press = Press(1, CableMove(3, pays_out=False), None, 0.0)
     travel.take_cycle(cycle([0] * 8, easy, 0.0, 0.0), press)
     assert (travel.cable, travel.limit) == (3, ""), "it is held, and has not moved yet"
     travel.take_cycle(cycle([0, 0, 0, 0, 7, 0, 0, 0], easy, 0.1, 1.0), None)

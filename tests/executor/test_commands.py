@@ -17,6 +17,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from executor.hold_to_run.presses import CableMove, PlatformMove
 from executor.remote.client import ask_all, final_status, no_answer, select_run, stop_runs
 from executor.remote.command_server import LONGEST_REQUEST, MOST_CLIENTS, serving
 from executor.remote.command_socket import RunConnection, find_runs
@@ -289,17 +290,9 @@ class _Presses:
     def __init__(self) -> None:
         self.calls: list[tuple[Any, ...]] = []
 
-    def hold(
-        self,
-        number: int,
-        direction: Any,
-        *,
-        in_platform: bool,
-        step: float | None,
-        percent: int,
-        age: float,
-    ) -> bool:
-        self.calls.append((number, direction.tolist(), in_platform, step, percent, age))
+    def hold(self, number: int, move: Any, *, step: float | None, percent: int, age: float) -> bool:
+        direction = move.direction.tolist()
+        self.calls.append((number, direction, move.in_platform, step, percent, age))
         return number < 9
 
     def let_go(self, number: int) -> None:
@@ -378,14 +371,12 @@ class _Noted:
     def __init__(self) -> None:
         self.said: list[Any] = []
 
-    def hold(self, number: int, direction: Any, **how: Any) -> bool:
-        self.said.append((number, direction.tolist(), how))
-        return True
-
-    def hold_cable(self, number: int, cable: int, **how: Any) -> bool:
-        if cable == 9:
+    def hold(self, number: int, move: Any, **how: Any) -> bool:
+        if isinstance(move, PlatformMove):
+            move = (move.direction.tolist(), move.in_platform)
+        elif move.cable == 9:
             raise ValueError("there is no cable 9")
-        self.said.append((number, cable, how))
+        self.said.append((number, move, how))
         return number != 13
 
     def let_go(self, number: int) -> None:
@@ -404,13 +395,12 @@ def _held(**values: Any) -> tuple[dict[str, Any], list[Any]]:
 def test_a_held_control_moves_the_platform_or_one_cable():
     answer, said = _held(press=1, direction=[0, 0, 2 / 3], frame="platform", step_mm=1.0)
     assert answer["ok"]
-    assert said == [
-        (1, [0, 0, 1], {"in_platform": True, "step": 0.001, "percent": 100, "age": 0.0})
-    ]
+    assert said == [(1, ([0, 0, 1], True), {"step": 0.001, "percent": 100, "age": 0.0})]
     answer, said = _held(press=2, cable=3, sense="pay_out", percent=7)
     assert answer["ok"]
-    assert said == [(2, 3, {"pays_out": True, "step": None, "percent": 7, "age": 0.0})]
-    assert _held(press=2, cable=3, sense="wind_in")[1][0][2]["pays_out"] is False
+    how = {"step": None, "percent": 7, "age": 0.0}
+    assert said == [(2, CableMove(3, pays_out=True), how)]
+    assert _held(press=2, cable=3, sense="wind_in")[1][0][1] == CableMove(3, pays_out=False)
 
 
 @pytest.mark.parametrize(

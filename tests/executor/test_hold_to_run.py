@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from executor import winch_runs
 from executor.hold_to_run import session as sessions
 from executor.hold_to_run.line import FIRST_ROWS, MOST_ROWS, JogLine, JogProver, Piece, PieceRing
-from executor.hold_to_run.presses import TIMEOUT, PressBoard
+from executor.hold_to_run.presses import TIMEOUT, PlatformMove, PressBoard
 from executor.hold_to_run.session import jog_session
 from executor.jogging import with_speed
 from executor.realtime.scheduling import SimulatedClock
@@ -73,9 +73,8 @@ class Script:
 def hold(
     number: int, direction: Array, step: float | None = None, percent: int = 100
 ) -> Callable[[PressBoard], object]:
-    return lambda board: board.hold(
-        number, direction, in_platform=False, step=step, percent=percent
-    )
+    move = PlatformMove(direction, in_platform=False)
+    return lambda board: board.hold(number, move, step=step, percent=percent)
 
 
 def positions(records: list[CycleRecord]) -> Array:
@@ -329,14 +328,14 @@ def test_the_set_up_of_the_drives_is_no_time_without_a_held_control(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Many drives with slow SDO answers take minutes: the session ended with its first cycle."""
-    make_mover = winch_runs.WinchesHere
+    make_mover = winch_runs.MotionHere
 
-    def after_a_minute(task: Any, drives: Any, clock: SimulatedClock, board: Any) -> Any:
+    def after_a_minute(task: Any, drives: Any, clock: SimulatedClock, *others: Any) -> Any:
         for _ in range(round(60.0 / rig().cycle)):
             clock.next_cycle()
-        return make_mover(task, drives, clock, board)
+        return make_mover(task, drives, clock, *others)
 
-    monkeypatch.setattr(winch_runs, "WinchesHere", after_a_minute)
+    monkeypatch.setattr(winch_runs, "MotionHere", after_a_minute)
     monkeypatch.setattr(sessions, "IDLE", 5.0)
     records = Script([], 99.0).run(scene())
     assert 60.0 < records[0].at < 62.0

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from executor.hold_to_run.presses import (
     TIMEOUT,
-    CablePress,
-    PlatformPress,
+    CableMove,
+    PlatformMove,
     PressBoard,
     PressReader,
     PressRule,
@@ -22,6 +22,7 @@ from executor.hold_to_run.presses import (
 )
 
 UP = np.array([0.0, 0.0, 1.0])
+ALONG_Z = PlatformMove(UP, in_platform=False)
 NUMBERS = st.integers(1, 6)
 TIMES = st.floats(0.0, 2.0)
 
@@ -53,7 +54,7 @@ def board(time: Time) -> PressBoard:
 
 
 def hold(board: PressBoard, number: int, percent: int = 100) -> bool:
-    return board.hold(number, UP, in_platform=False, step=None, percent=percent)
+    return board.hold(number, ALONG_Z, step=None, percent=percent)
 
 
 def test_a_press_lasts_150_ms_without_a_word() -> None:
@@ -88,7 +89,9 @@ def test_a_report_that_was_passed_on_late_counts_from_when_it_was_made(
     board: PressBoard, time: Time
 ) -> None:
     def old(number: int, age: float) -> bool:
-        return board.hold(number, UP, in_platform=False, step=None, percent=100, age=age)
+        return board.hold(
+            number, PlatformMove(UP, in_platform=False), step=None, percent=100, age=age
+        )
 
     reader = PressReader(board.memory, time)
     assert not old(1, TIMEOUT + 0.001), "it is over before it begins"
@@ -117,11 +120,11 @@ def test_letting_go_of_an_earlier_press_leaves_the_newest_held(board: PressBoard
 def test_cables_are_numbered_from_one(time: Time, cable: int) -> None:
     board = PressBoard(time, cables=8)
     if 1 <= cable <= 8:
-        assert board.hold_cable(1, cable, pays_out=True, step=None, percent=100)
+        assert board.hold(1, CableMove(cable, pays_out=True), step=None, percent=100)
         assert PressReader(board.memory, time).read().cable == cable
     else:
         with pytest.raises(ValueError, match=f"no cable {cable}"):
-            board.hold_cable(1, cable, pays_out=True, step=None, percent=100)
+            board.hold(1, CableMove(cable, pays_out=True), step=None, percent=100)
     board.close()
 
 
@@ -182,11 +185,12 @@ def test_a_press_is_held_as_long_as_it_is_reported(board: PressBoard, time: Time
 
 def test_what_a_press_requested_first_stays(board: PressBoard) -> None:
     hold(board, 1)
-    board.hold(1, -UP, in_platform=True, step=0.001, percent=50)
+    board.hold(1, PlatformMove(-UP, in_platform=True), step=0.001, percent=50)
     press = board.held()
-    assert isinstance(press, PlatformPress)
-    assert (press.direction == UP).all()
-    assert (press.in_platform, press.step) == (False, None)
+    assert press is not None
+    assert isinstance(press.move, PlatformMove)
+    assert (press.move.direction == UP).all()
+    assert (press.move.in_platform, press.step) == (False, None)
     assert PressReader(board.memory, lambda: 10.0).read().share == 0.5, "but its speed may change"
 
 
@@ -274,7 +278,7 @@ def cables(time: Time) -> PressBoard:
 def test_the_loop_reads_cable_sense_and_step(
     cables: PressBoard, time: Time, out: bool, step: float | None
 ) -> None:
-    assert cables.hold_cable(4, 8, pays_out=out, step=step, percent=30)
+    assert cables.hold(4, CableMove(8, pays_out=out), step=step, percent=30)
     state = PressReader(cables.memory, time).read()
     assert (state.press, state.cable, state.pays_out, state.step) == (4, 8, out, step)
     assert state.share == 0.3
@@ -282,19 +286,19 @@ def test_the_loop_reads_cable_sense_and_step(
 
 def test_a_press_keeps_its_cable(cables: PressBoard, time: Time) -> None:
     """Later reports under the same number change neither cable nor sense nor length."""
-    cables.hold_cable(4, 3, pays_out=False, step=None, percent=100)
-    assert cables.hold_cable(4, 5, pays_out=True, step=0.001, percent=50)
+    cables.hold(4, CableMove(3, pays_out=False), step=None, percent=100)
+    assert cables.hold(4, CableMove(5, pays_out=True), step=0.001, percent=50)
     state = PressReader(cables.memory, time).read()
     assert (state.cable, state.pays_out, state.step, state.share) == (3, False, None, 0.5)
     press = cables.held()
-    assert isinstance(press, CablePress)
-    assert (press.cable, press.pays_out) == (3, False)
+    assert press is not None
+    assert press.move == CableMove(3, pays_out=False)
 
 
 @pytest.mark.parametrize("cable", [0, 9, -1])
 def test_a_cable_that_is_not_there_is_not_held(cables: PressBoard, cable: int) -> None:
     with pytest.raises(ValueError, match=f"no cable {cable}"):
-        cables.hold_cable(1, cable, pays_out=False, step=None, percent=100)
+        cables.hold(1, CableMove(cable, pays_out=False), step=None, percent=100)
     assert cables.held() is None
 
 
@@ -302,7 +306,7 @@ def test_a_session_moves_either_cables_or_the_platform(
     board: PressBoard, cables: PressBoard
 ) -> None:
     with pytest.raises(ValueError, match="moves the platform"):
-        board.hold_cable(1, 1, pays_out=False, step=None, percent=100)
+        board.hold(1, CableMove(1, pays_out=False), step=None, percent=100)
     with pytest.raises(ValueError, match="one cable at a time"):
         hold(cables, 1)
     assert board.held() is None

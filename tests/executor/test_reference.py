@@ -517,26 +517,22 @@ def test_braked_drives_that_were_not_enabled_after_all_need_not_have_held(
     reference = reference_of(rig)
     MotionInterlock(rig).file.write(reference.model_copy(update={"released": [*ALL]}))
     mover: Any = Unmoved(Armed("", tuple(reference.stands_at), released=ALL))
-    records: Any = SimpleNamespace(folder=SimpleNamespace(path=tmp_path), take_event=print)
+    folder = SimpleNamespace(path=tmp_path)
+    records: Any = SimpleNamespace(folder=folder, take_event=print, pose_every=0)
     if path:
         records.log = SimpleNamespace(last=None)
         motion = SimpleNamespace(of=lambda *_args, **_more: None)
         monkeypatch.setattr(path_runs, "PathMotion", motion)
-        monkeypatch.setattr(path_runs, "real_time_process", lambda *_, **__: nullcontext(mover))
         monkeypatch.setattr(path_runs, "checked_setpoints_of", id)
         monkeypatch.setattr(path_runs, "load_changes", lambda *_: None)
         table = SimpleNamespace(table=SimpleNamespace(dwells=()))
         prepared: Any = SimpleNamespace(
             rig=MotionInterlock(rig).referenced_rig(), scene=None, checked=table
         )
-        path_runs.run_in_real_time(
+        path_runs.run_along_path(
             prepared,
+            lambda _motion: nullcontext(mover),
             records,
-            records,
-            records,
-            pose_every=0,
-            need_real_time=False,
-            check_drives=lambda _released: "",
             before_motion=lambda _denied: None,
         )
     else:

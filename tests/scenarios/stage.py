@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,8 +16,10 @@ from drivers.cia402.state_machine import DriveState
 from drivers.drive_group import DriveGroup
 from drivers.factory import make_drive_group
 from executor.cameras.multi_camera import CameraRecords
-from executor.control.path_runs import Outcome, run_in_process
+from executor.control.path_runs import Outcome, PathMotion, run_along_path
 from executor.evaluation import evaluate, write_end
+from executor.realtime.child import ReadyDrives
+from executor.realtime.process import MotionHere
 from executor.recording.record_files import RunCourse
 from executor.recording.recorder import FrameTrigger, Recorder
 from executor.recording.run_folder import RunEvent, RunFolder
@@ -61,6 +63,7 @@ class Stage:
     armed: bool = False
     status: RunStatus | None = None
     recorder: Recorder | None = None
+    mover: MotionHere | None = None
     drive_states: list[tuple[DriveState, ...]] = field(default_factory=list)
 
     def next_cycle(self) -> float:
@@ -99,7 +102,7 @@ class Stage:
     ) -> Outcome:
         """Arms and does the whole motion."""
 
-        def on_armed() -> None:
+        def on_armed(_denied: str) -> None:
             self.armed = True
             before_motion()
 
@@ -113,16 +116,12 @@ class Stage:
             progress=progress,
             announce=lambda _text: None,
         )
-        return run_in_process(
-            self.prepared,
-            self.group,
-            self,
-            self.board,
-            recorder,
-            true_pose=None,
-            carry=self.rehearsal.carry,
-            before_motion=on_armed,
-        )
+        return run_along_path(self.prepared, self._mover, recorder, before_motion=on_armed)
+
+    def _mover(self, motion: PathMotion) -> AbstractContextManager[MotionHere]:
+        drives = ReadyDrives(self.prepared.rig, self.group, None, self.rehearsal.carry, ())
+        self.mover = MotionHere(motion, drives, self, self.board)
+        return nullcontext(self.mover)
 
     def events(self) -> list[RunEvent]:
         return self.folder.events()

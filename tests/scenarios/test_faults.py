@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,7 @@ from executor.recording.run_folder import NEEDED, RunEvent, RunFolder
 from executor.safety.fault_messages import NOTE_EVENTS
 from executor.state_machine import State
 from executor.supervision import OperatorRequests, StopReason
-from executor.trajectory.setpoints import PreparedRun, Trajectory, prepare
+from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Fault, Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.files.rig_file import RigDocument
@@ -73,10 +73,12 @@ def late(stage: Stage) -> None:
 
 
 def jump_in_table(stage: Stage) -> None:
-    """As if memory had changed after the check."""
-    table: Trajectory = stage.prepared.checked.table
-    table.setpoints.setflags(write=True)
-    table.setpoints[CRUISING + 5 :, 3] += 4000
+    """As if the loop's memory had changed after arming, although it is sealed."""
+    mover: Any = stage.mover
+    loop = mover._loop
+    setpoints = loop._checked.setpoints.copy()
+    setpoints[CRUISING + 5 :, 3] += 4000
+    loop._checked = replace(loop._checked, setpoints=setpoints)
 
 
 def unplug(stage: Stage) -> None:

@@ -24,7 +24,7 @@ from drivers.factory import make_drive_group, read_drives
 from executor.cameras.client import static_pose
 from executor.control.preconditions import require_below, with_counts_at, with_reduced_limits
 from executor.control.winch_laws import CableStep, PretensionLaw, WinchLaw, wind_in_speed
-from executor.control.winch_loop import LawMotion, WinchesHere
+from executor.control.winch_loop import LawMotion
 from executor.control.winch_motion import WinchResult, move_winches, recording, require_held
 from executor.drives import current_pose
 from executor.homing import home, reference_at
@@ -33,6 +33,7 @@ from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference, referenced
 from executor.jogging import plan_straight_move
 from executor.realtime.child import ReadyDrives
+from executor.realtime.process import MotionHere
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import CycleRecord, LoopEvent, State
@@ -73,12 +74,12 @@ class Records:
 
 def mover(
     counted: Rig, as_set_up: Rig, law: WinchLaw, group: DriveGroup, board: LocalRequests
-) -> WinchesHere:
+) -> MotionHere:
     """A law in simulated time, on configured drives."""
     drives = ReadyDrives(counted, group, None, lambda _load: None, ())
     limit, speed = as_set_up.max_tension, max(w.max_speed for w in as_set_up.winches)
     motion = LawMotion(as_set_up.cable_count, 0.01, lambda _rig, _counts: law, limit, speed)
-    return WinchesHere(motion, drives, SimulatedClock(0.01), board)
+    return MotionHere(motion, drives, SimulatedClock(0.01), board)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from drivers.can_bus import BusSettings
-from executor.control.path_runs import run_in_real_time
+from executor.control.path_runs import run_along_path
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import ReferenceFile
@@ -175,13 +175,9 @@ def test_the_executor_itself_refuses_a_latched_bus(prepared: PreparedRun, tmp_pa
     FaultLatch(settings).engage("rig", tmp_path, "cable 4 is slack")
     nothing: Any = None
     with pytest.raises(Refused, match="cable 4 is slack"):
-        run_in_real_time(
+        run_along_path(
             on_bus,
             nothing,
             nothing,
-            nothing,
-            pose_every=0,
-            need_real_time=False,
-            check_drives=nothing,
             before_motion=lambda _denied: pytest.fail("it was about to move"),
         )

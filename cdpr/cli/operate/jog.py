@@ -33,7 +33,7 @@ from cdpr.cli.output import err, out, show_json, show_line
 from executor import jogging
 from executor.drives import is_simulated
 from executor.hold_to_run.line import JogProver
-from executor.hold_to_run.presses import TIMEOUT, PressBoard, press_clock
+from executor.hold_to_run.presses import TIMEOUT, PlatformMove, PressBoard, press_clock
 from executor.hold_to_run.session import cable_session, jog_session
 from executor.jogging import FASTEST, SPEED
 from executor.state_machine import CycleRecord, State
@@ -327,13 +327,8 @@ class JogKeys:
         self._send(presses)
 
     def _send(self, presses: PressBoard) -> bool:
-        return presses.hold(
-            self._number,
-            np.array(DIRECTIONS[self._key]),
-            in_platform=self._in_platform,
-            step=None,
-            percent=self._percent,
-        )
+        move = PlatformMove(np.array(DIRECTIONS[self._key]), self._in_platform)
+        return presses.hold(self._number, move, step=None, percent=self._percent)
 
     def _show(self, prover: JogProver) -> None:
         x, y, z = prover.pose.position * 1e3

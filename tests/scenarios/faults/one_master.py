@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import signal
-from dataclasses import replace
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.factory import make_drive_group
-from executor.control.path_runs import run_in_process
+from executor.control.path_runs import run_along_path
+from executor.realtime.child import ReadyDrives
+from executor.realtime.process import MotionHere
 from executor.realtime.scheduling import RealClock, real_time
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.supervision import LocalRequests
@@ -55,7 +57,6 @@ def _moved(
         update={"interface": settings.interface, "channel": settings.channel}
     )
     rig = rig_from_document(prepared.rig.document.model_copy(update={"bus": document}))
-    prepared = replace(prepared, rig=rig)
     folder = _Folder(path)
     recorder = recorder_for(prepared, folder, board)
     # The program writes cycles in the process that supervises, never in the one of the loop.
@@ -63,15 +64,13 @@ def _moved(
     with open_bus(settings) as bus, real_time():
         group = make_drive_group(rig, bus)
         group.configure()
-        outcome = run_in_process(
-            prepared,
-            group,
-            RealClock(prepared.checked.table.cycle),
-            board,
+        drives = ReadyDrives(rig, group, None, lambda _load: None, ())
+        clock = RealClock(prepared.checked.table.cycle)
+        outcome = run_along_path(
+            prepared,  # on a virtual bus: no latch, no reference
+            lambda motion: nullcontext(MotionHere(motion, drives, clock, board)),
             recorder,
-            true_pose=None,
-            carry=lambda _load: None,
-            before_motion=lambda: None,
+            before_motion=lambda _denied: None,
         )
     folder.write()
     table = recorder.log.table()
