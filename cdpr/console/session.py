@@ -41,6 +41,7 @@ from cdpr.console.state import (
     jog_state,
     local_file,
     measured_state,
+    none_found,
     not_stopped,
     read_stored,
     stored_state,
@@ -160,7 +161,7 @@ class Console:
             "simulated": is_simulated(rig),
             "homes_by": without_passwords(self.files.cameras[0]) if self.files.cameras else None,
             "home_mm": np.round(1e3 * rig.home.position, 3).tolist(),
-            **stored_state(self._stored, seen.why_lost),
+            **stored_state(self._stored, seen),
             "busy": busy_state(verb, self._line, self.plan.loading),
             "outcome": outcome_state(self.verbs.outcome),
             "motion": None if status is None else {**status, "age_s": round(age, 3)},
@@ -204,9 +205,11 @@ class Console:
         result, ended = stop_runs(), self.verbs.stop_before_motion()
         if result.silent:
             return "a run does not answer: press the emergency stop"
-        if why_not := not_stopped(self.rig):
+        is_found = ended or bool(result.stopped)
+        is_using = is_found or self.verbs.verb not in (None, "plan")
+        if why_not := not_stopped(self.rig, None if is_using else self._one_at_a_time):
             return why_not
-        return "" if result.stopped or ended else "nothing moves"
+        return "" if is_found else none_found(self.rig, self.robot.now)
 
     def command(self, page: int, message: Message, arrived: float) -> str:
         """Executes a page's command except STOP; returns why not, or an empty text.

@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from cdpr.console.commands import PageControl, Seen
-from cdpr.console.view import measured_view
+from cdpr.console.view import RobotReport, measured_view
 from drivers.can_bus import BusSettings
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch, LatchedFault
 from executor.interlock.interlock import MotionInterlock, reference_status
-from executor.interlock.locks import ControlLock
+from executor.interlock.locks import ControlLock, SetUpLock
 from executor.jogging import FASTEST
 from model.errors import BadInput, CdprError
 from model.rig import Rig
@@ -29,6 +29,7 @@ from model.rig import Rig
 MOST_IN_TRANSIT = 2
 #: Time for which the page shows that a press did not begin, [s].
 NOT_BEGUN_SHOWN = 5.0
+_IF_IT_MOVES = "press the emergency stop if the robot moves"
 #: Folder of the plans and scenes that the console writes.
 MADE = Path("console")
 
@@ -140,15 +141,20 @@ class StoredState:
     moved_by: int | None = None
 
 
-def stored_state(stored: StoredState, why_lost: str | None) -> dict[str, Any]:
+def stored_state(stored: StoredState, seen: RobotReport) -> dict[str, Any]:
     """The fault latch, a motion of another user, and the homing reference.
 
     Args:
         stored: From their files.
-        why_lost: Why the drives, as read, must be homed.
+        seen: The drives, as read.
     """
-    why_not = stored.why_not or why_lost
-    reference = {"counts": stored.referenced and not why_not, "why_not": why_not}
+    why_not = stored.why_not or seen.why_lost
+    is_known = why_not is not None or not seen.is_unread
+    reference = {
+        "counts": stored.referenced and is_known and why_not is None,
+        "known": is_known,
+        "why_not": why_not if is_known else seen.why_not,
+    }
     return {"latched": stored.latched, "moved_by": stored.moved_by, "reference": reference}
 
 
@@ -179,20 +185,53 @@ def _read_latch(rig: Rig) -> tuple[LatchedFault | None, int | None]:
     return fault, None
 
 
-def not_stopped(rig: Rig) -> str:
-    """What a stop of this user's runs leaves moving on a rig's bus; empty if nothing."""
+def not_stopped(rig: Rig, at_rest: threading.RLock | None) -> str:
+    """What a stop of this user's runs leaves moving on a rig's bus; empty if nothing is found.
+
+    Args:
+        rig: The robot and its bus.
+        at_rest: Held while this console reads the drives; None while it may use them otherwise.
+    """
     if is_simulated(rig):
         return ""
     try:
         _, process = _read_latch(rig)
+        is_set_up = process is None and _is_set_up_elsewhere(rig, at_rest)
     except CdprError as error:
         return f"whether another user moves the robot is unknown: {error.what}"
-    if process is None:
-        return ""
-    return (
-        f"a motion of another user, process {process}, is not stopped from here:"
-        " press the emergency stop"
-    )
+    if process is not None:
+        return (
+            f"a motion of another user, process {process}, is not stopped from here:"
+            " press the emergency stop"
+        )
+    if is_set_up:
+        return f"another program sets up or reads the drives and is not stopped: {_IF_IT_MOVES}"
+    return ""
+
+
+def _is_set_up_elsewhere(rig: Rig, at_rest: threading.RLock | None) -> bool:
+    """Whether another program sets up the drives for a motion, or reads them."""
+    if at_rest is None or not at_rest.acquire(blocking=False):
+        return False
+    try:
+        with SetUpLock(BusSettings.of(rig)).tried() as is_free:
+            return not is_free
+    finally:
+        at_rest.release()
+
+
+def none_found(rig: Rig, seen: RobotReport) -> str:
+    """Answer to a stop that found no motion; one of another user may be unknown here.
+
+    Args:
+        rig: The robot and its bus.
+        seen: The drives, as read.
+    """
+    if is_simulated(rig):
+        return "nothing moves"
+    if seen.in_use:
+        return f"as last read, {seen.why_not}: {_IF_IT_MOVES}"
+    return f"no motion of this user was found: {_IF_IT_MOVES}"
 
 
 def jog_state(status: dict[str, Any] | None) -> dict[str, Any]:

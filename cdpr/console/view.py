@@ -128,6 +128,35 @@ class RobotNow:
     nearest: Nearest | None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotReport:
+    """What is known of the robot; tensions may be known without a pose.
+
+    Attributes:
+        robot: None if no pose is known, or none fits the cables.
+        tensions: [N]; None if unknown, as for a drive without torque.
+        at: ISO time of these values if nothing watches the drives; None while a run reports.
+        why_not: Why some of it is unknown, or older than the last attempt to read it.
+        why_lost: Why the drives, as read, must be homed.
+        is_unread: The last reading failed: whether the reference is valid is unknown.
+        in_use: Another program commanded or used the drives at the last reading; see ``why_not``.
+    """
+
+    robot: RobotNow | None
+    tensions: list[float | None] | None
+    at: str | None = None
+    why_not: str | None = None
+    why_lost: str | None = None
+    is_unread: bool = False
+    in_use: bool = False
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """Data for the page on values that are not live or incomplete; None if live."""
+        if self.at is None and self.why_not is None:
+            return None
+        return {"at": self.at, "why_not": self.why_not, "in_use": self.in_use}
+
+
 class RobotView:
     """Tracks the robot's pose from one status to the next."""
 

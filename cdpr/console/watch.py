@@ -16,7 +16,8 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Any
 
-from cdpr.console.view import RobotNow, RobotView, commanded_pose
+from cdpr.console.view import RobotReport, RobotView, commanded_pose
+from drivers.can_errors import ForeignMaster
 from executor.cameras.live_image import ImageReader, LiveImage
 from executor.drives import is_simulated
 from executor.remote.client import Answer, RunLink, cable_tension
@@ -47,6 +48,7 @@ _OVER = {
     "stopped": "is over: it was stopped",
     "latched": "is over: a fault stopped it",
 }
+_NONE = "no motion of this user is in progress"
 _SILENT = "the run does not answer"
 _MOVES = "the robot moves; wait, or stop it"
 _PREPARED = "a motion is being prepared; wait, or stop it"
@@ -135,11 +137,11 @@ class RunWatch:
         """
         with self._lock:
             if self._run is None:
-                return "nothing moves"
+                return _NONE
             if self._run.owed:
                 self._take(self._run.hear(PATIENCE))
                 if self._run is None:
-                    return "nothing moves"
+                    return _NONE
                 if self._run.owed and command not in _ALWAYS:
                     return _SILENT
             if received is not None:
@@ -213,31 +215,6 @@ class RunWatch:
 # Pose and tensions of the robot.
 #: Drives that another program used are read again after this time, [s].
 USED_FOR = 1.0
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RobotReport:
-    """What is known of the robot; tensions may be known without a pose.
-
-    Attributes:
-        robot: None if no pose is known, or none fits the cables.
-        tensions: [N]; None if unknown, as for a drive without torque.
-        at: ISO time of these values if nothing watches the drives; None while a run reports.
-        why_not: Why some of it is unknown, or older than the last attempt to read it.
-        why_lost: Why the drives, as read, must be homed.
-    """
-
-    robot: RobotNow | None
-    tensions: list[float | None] | None
-    at: str | None = None
-    why_not: str | None = None
-    why_lost: str | None = None
-
-    def as_dict(self) -> dict[str, Any] | None:
-        """Data for the page on values that are not live or incomplete; None if live."""
-        if self.at is None and self.why_not is None:
-            return None
-        return {"at": self.at, "why_not": self.why_not}
 
 
 class RobotWatch:
@@ -337,19 +314,27 @@ class RobotWatch:
             self._answer = self._pool.submit(self._read)
 
     def _take_reading(self, read: Callable[[], StatusResult]) -> None:
-        """Takes a reading; silent drives leave nothing known, whatever was known before."""
+        """Takes a reading; silent drives leave nothing known but a loss of the reference."""
         try:
             result = read()
             if result.missing is not None:
                 raise result.missing
-        except CdprError as error:
-            seen = RobotReport(None, None, _local_time(), error.what)
         except Exception as error:  # such as an adapter that was unplugged
-            seen = RobotReport(None, None, _local_time(), f"{type(error).__name__}: {error}")
+            why = error.what if isinstance(error, CdprError) else f"{type(error).__name__}: {error}"
+            seen = RobotReport(
+                robot=None,
+                tensions=None,
+                at=_local_time(),
+                why_not=why,
+                why_lost=self.now.why_lost,
+                is_unread=True,
+                in_use=isinstance(error, ForeignMaster),
+            )
         else:
             if result.drives is None:
                 self._due = time.monotonic() + USED_FOR
-                seen = replace(self.now, why_not="another program uses the drives")
+                used = "another program uses the drives"
+                seen = replace(self.now, why_not=used, in_use=True)
             else:
                 robot, reference = self._view.at_rest(result), result.reference
                 why_not = result.why_no_pose or reference.why_not

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -182,13 +183,16 @@ def select_run(runs: Sequence[RunConnection], process: int | None, verb: str) ->
 
 def no_run(verb: str) -> Fault:
     """Error when no run was found."""
+    whose = started = stopped = ""
+    if os.geteuid() != 0:  # root reaches the runs of all users
+        whose, started = " for this user", ", or another user started it"
+        stopped = "; a run of another user is stopped by that user, or with `sudo cdpr stop`"
     return Fault(
-        "no active run found for this user",
+        f"no active run found{whose}",
         where=f"cdpr {verb}",
-        why="it has ended, is still being prepared (`cdpr stop` cancels it, also one that was just"
-        " started), or another user started it",
-        next_step="press the emergency stop if the robot moves; a run of another user is"
-        f" stopped by that user, or with `sudo cdpr {verb}`",
+        why="it has ended, or is still being prepared (`cdpr stop` cancels it, also one that was"
+        f" just started){started}",
+        next_step=f"press the emergency stop if the robot moves{stopped}",
     )
 
 

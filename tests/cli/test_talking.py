@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 import pytest
 
 from cdpr.cli.app import VERBS, LazyGroup
+from executor.remote.client import no_run
 from model import jit as machine_code
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import Answer, call
@@ -129,6 +130,22 @@ def test_a_wish_that_reaches_no_run_is_no_success(verb: tuple[str, ...]) -> None
     assert reply.code == 1
     assert "no active run found" in reply.err
     assert "emergency stop" in reply.err
+
+
+@pytest.mark.parametrize("verb", ["hold", "resume", "speed", "monitor", "stop"])
+def test_a_run_of_another_user_is_stopped_by_stop_whatever_was_asked(
+    monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    """`sudo cdpr resume`, which was named as the stop, would set a held platform in motion."""
+    monkeypatch.setattr(os, "geteuid", lambda: 1000)
+    error = no_run(verb)
+    assert "stopped by that user, or with `sudo cdpr stop`" in error.next_step
+    assert "for this user" in error.what
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    error = no_run(verb)
+    assert error.what == "no active run found"
+    assert error.next_step == "press the emergency stop if the robot moves"
+    assert "another user" not in error.why
 
 
 @pytest.mark.parametrize("percent", ["0", "101", "-5", "fast"])

@@ -275,6 +275,7 @@ class Fake:
             "moved_by": None,
             "reference": {
                 "counts": self.homed,
+                "known": True,
                 "why_not": None if self.homed else "cable 3 was switched on again",
             },
             "busy": busy,

@@ -492,7 +492,8 @@ def test_limits_are_shown_as_stated(desk: Visit) -> None:
 def test_nothing_known_is_shown_as_not_known(desk: Visit) -> None:
     keys = ("platform", "tensions_n", "clearance_mm", "next_stop", "preview", "motion", "busy")
     keys += ("measured",)
-    desk.fake.ask(state={**dict.fromkeys(keys), "reference": {"counts": False, "why_not": None}})
+    reference = {"counts": False, "known": True, "why_not": None}
+    desk.fake.ask(state={**dict.fromkeys(keys), "reference": reference})
     for name in ("x", "tilt", "clearance", "stop", "following", "lost"):
         expect(desk.page.locator(f"#value-{name}")).to_have_text("–")
     expect(desk.page.locator("#tension-trouble")).to_contain_text("Unknown")

@@ -21,7 +21,7 @@ def state_of(**changes: Any) -> dict[str, Any]:
         "read_only": False,
         "control": {"yours": True, "held_by": "A", "mode": "operate"},
         "latched": None,
-        "reference": {"counts": True, "why_not": None},
+        "reference": {"counts": True, "known": True, "why_not": None},
         "busy": None,
         "motion": None,
         "platform": {},
@@ -72,7 +72,7 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
     ),
     (
         "not homed",
-        {"reference": {"counts": False, "why_not": "x"}},
+        {"reference": {"counts": False, "known": True, "why_not": "x"}},
         (ALWAYS | TAUGHT | REST) - {"run", "jog_begin"},
     ),
     ("no plan", {"preview": None}, (ALWAYS | TAUGHT | REST) - {"run", "compare"}),
@@ -116,7 +116,7 @@ TABLE: list[tuple[str, dict[str, Any], set[str]]] = [
     ),
     (
         "service mode",
-        {"control": SERVICE, "reference": {"counts": False, "why_not": "x"}},
+        {"control": SERVICE, "reference": {"counts": False, "known": True, "why_not": "x"}},
         (ALWAYS | TAUGHT | REST | {"service_end", "cable_begin"})
         - {"service_begin", "run", "jog_begin"},
     ),

@@ -316,7 +316,8 @@ def test_the_pad_stays_where_it_is_whatever_is_shown(browser: Browser, fake: Fak
             found.page.evaluate("() => window.dispatchEvent(new Event('blur'))")
             found.page.mouse.up()
             expect(found.page.locator("#jog-said")).to_contain_text("Ended: the window lost")
-            lamps = {"reference": {"counts": False, "why_not": "cable 3 was switched on again"}}
+            why = "cable 3 was switched on again"
+            lamps = {"reference": {"counts": False, "known": True, "why_not": why}}
             found.fake.ask(state={**changes, **more, **lamps})
             expect(found.page.locator("#jog-limit")).to_contain_text("comes to rest within 17.1 mm")
             expect(found.page.locator("#latched")).to_be_visible()

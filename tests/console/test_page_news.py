@@ -132,6 +132,43 @@ def test_a_stop_by_the_operator_is_no_failure(desk: Visit) -> None:
     assert desk.page.locator("#outcome-title").evaluate(colour) != ink
 
 
+def test_the_headline_of_a_stop_is_no_error(desk: Visit) -> None:
+    text = "waiting for presses\nerror: stopped; the drives hold\n  next: begin again"
+    ended = {**LONG, "text": text, "stopped": True}
+    desk.fake.ask(set={"outcome": ended})
+    expect(desk.page.locator("#outcome-headline")).to_have_text("Stopped; the drives hold")
+    desk.fake.ask(set={"outcome": {**ended, "stopped": False}})
+    expect(desk.page.locator("#outcome-headline")).to_have_text("error: stopped; the drives hold")
+
+
+def test_a_robot_on_a_bus_is_not_said_to_rest_while_another_program_uses_it(desk: Visit) -> None:
+    """STOP reaches no motion of another user: its answer stays until a motion begins here."""
+    words = "another program sends set-points to drive 1"
+    read = {"at": "2026-01-02T03:04:05+00:00", "why_not": words, "in_use": True}
+    desk.fake.ask(state={"simulated": False})
+    expect(desk.page.locator("#progress-text")).to_have_text(
+        "No motion of this user is in progress."
+    )
+    desk.page.clock.install()
+    desk.page.keyboard.press(" ")
+    answer = desk.page.locator("#stop-answer")
+    expect(answer).to_have_class("failed")
+    unread = {"counts": False, "known": False, "why_not": words}
+    desk.fake.ask(state={"simulated": False, "drives_read": read, "reference": unread})
+    expect(desk.page.locator("#motion-text")).to_have_text("Used by another program")
+    expect(desk.page.locator("#progress-text")).to_have_text(f"As last read, {words}.")
+    expect(desk.page.locator("#lamp-homed")).to_have_text("Homed: unknown")
+    expect(desk.page.locator("#homed-text")).to_have_text(f"Homed: unknown: {words}.")
+    desk.page.clock.run_for(7000)
+    expect(answer).to_have_text("nothing moves")
+    answer.click()
+    expect(answer).to_have_text("")
+    desk.page.keyboard.press(" ")
+    expect(answer).to_have_class("failed")
+    desk.fake.ask(state={"simulated": True, "drives_read": None}, set={"moving": "moving"})
+    expect(answer).to_have_text("")
+
+
 @pytest.mark.parametrize("size", SIZES)
 def test_the_result_comes_first_and_the_output_keeps_its_columns(
     browser: Browser, fake: Fake, size: str

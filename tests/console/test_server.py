@@ -18,6 +18,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -52,12 +53,13 @@ from cdpr.console.verbs import (
     _without_commands,
     outcome_state,
 )
-from cdpr.console.view import preview
+from cdpr.console.view import RobotReport, preview
 from cdpr.console.watch import RobotWatch, RunReport, RunWatch
 from drivers.can_bus import BusSettings
 from executor.cameras.sources import SYNTHETIC, choose_cameras
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
+from executor.interlock.locks import SetUpLock
 from executor.remote.client import preparations, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
@@ -1145,7 +1147,7 @@ def require_only_latched(console: Console, words: str) -> None:
     state = console.update()
     assert words in state["latched"]
     assert state["moved_by"] is None
-    assert console.stop() == "nothing moves"
+    assert console.stop() == NONE_FOUND
 
 
 def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
@@ -1168,7 +1170,7 @@ def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
         assert (state["latched"], state["moved_by"]) == (None, moved_by)
         answer = console.stop()
         if moved_by is None:
-            assert answer == "nothing moves", "a run of this user takes the stop itself"
+            assert answer == NONE_FOUND, "a run of this user takes the stop itself"
         else:
             assert f"process {HIDDEN}, is not stopped from here" in answer
             assert "press the emergency stop" in answer
@@ -1180,6 +1182,41 @@ def test_a_motion_of_another_user_is_no_fault_and_stop_says_that_it_goes_on(
 
 #: Of another user.
 HIDDEN = 2**30
+NONE_FOUND = "no motion of this user was found: press the emergency stop if the robot moves"
+
+
+def test_a_stop_that_finds_no_motion_claims_nothing_about_a_robot_on_a_bus(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without a shared state folder another user's run is unknown: it said that nothing moves."""
+    console, _ = latching_console(monkeypatch, "239.74.9.16")
+    assert console.stop() == NONE_FOUND
+    words = "another program sends set-points to drive 1"
+    console.robot.now = RobotReport(None, None, why_not=words, in_use=True)
+    answer = console.stop()
+    assert words in answer
+    assert "press the emergency stop" in answer
+    console.close()
+
+
+def test_stop_names_a_program_that_sets_up_the_drives_unless_it_is_this_console(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another user's run engages the latch only after that."""
+    console, _ = latching_console(monkeypatch, "239.74.9.17")
+    lock = SetUpLock(BusSettings.of(console.rig))
+    with lock.held():
+        answer = console.stop()
+        assert "another program sets up or reads the drives" in answer
+        assert "press the emergency stop" in answer
+        with ThreadPoolExecutor(1) as pool, console._one_at_a_time:  # as during a reading
+            assert pool.submit(console.stop).result() == NONE_FOUND
+        for verb, is_named in (("plan", True), ("reset", False), ("run", False)):
+            console.verbs.verb = verb
+            assert (console.stop() == answer) == is_named
+        console.verbs.verb = None
+    assert console.stop() == NONE_FOUND
+    console.close()
 
 
 def test_a_reset_of_this_user_is_no_motion_of_another(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,16 +18,18 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import chdtr
 
-from cdpr.console.state import StoredState, jog_state, stored_state
+from cdpr.console.state import StoredState, jog_state, none_found, stored_state
 from cdpr.console.view import (
     ELLIPSOID_SCALE,
     RobotNow,
+    RobotReport,
     RobotView,
     commanded_pose,
     measured_view,
     nearest_data,
 )
 from cdpr.console.watch import USED_FOR, RobotWatch
+from drivers.can_errors import ForeignMaster
 from executor.drives import DriveStatus
 from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import RunFolder
@@ -242,14 +244,15 @@ def test_a_reference_that_the_drives_lost_is_not_valid_whatever_its_file_states(
     drives, valid = Drives(), StoredState(None, True, None)
     drives.rest()
     assert drives.watch.now.why_lost is None
-    assert stored_state(valid, None)["reference"] == {"counts": True, "why_not": None}
+    homed = {"counts": True, "known": True, "why_not": None}
+    assert stored_state(valid, drives.watch.now)["reference"] == homed
     drives.reading = RELEASED
     drives.watch.ask()
     drives.rest()
-    lost = {"counts": False, "why_not": "released"}
-    assert stored_state(valid, drives.watch.now.why_lost)["reference"] == lost
+    lost = {"counts": False, "known": True, "why_not": "released"}
+    assert stored_state(valid, drives.watch.now)["reference"] == lost
     noted = StoredState(None, False, "noted")
-    assert stored_state(noted, "released")["reference"] == {"counts": False, "why_not": "noted"}
+    assert stored_state(noted, drives.watch.now)["reference"] == {**lost, "why_not": "noted"}
     unread = ReferenceStatus(counts=True, why_not=None, made="", how="jig", file="")
     for reference in (
         replace(RELEASED.reference, valid_after_reset=True),
@@ -259,6 +262,54 @@ def test_a_reference_that_the_drives_lost_is_not_valid_whatever_its_file_states(
         drives.watch.ask()
         drives.rest()
         assert drives.watch.now.why_lost is None, "homing is not the next step"
+
+
+@pytest.mark.parametrize("unread", [replace(RELEASED, drives=None, missing=SILENT), SILENT])
+def test_whether_drives_that_do_not_answer_are_homed_is_unknown(
+    unread: StatusResult | Exception,
+) -> None:
+    """The page showed a green "Homed" beside drives that do not answer."""
+    drives, valid = Drives(), StoredState(None, True, None)
+    drives.rest()
+    drives.reading = unread
+    drives.watch.ask()
+    drives.rest()
+    why = "drive 3 does not answer"
+    unknown = {"counts": False, "known": False, "why_not": why}
+    assert stored_state(valid, drives.watch.now)["reference"] == unknown
+    noted = {"counts": False, "known": True, "why_not": "noted"}
+    assert stored_state(StoredState(None, False, "noted"), drives.watch.now)["reference"] == noted
+    drives.reading = Drives.held_at(THE_RIG.home)
+    drives.watch.ask()
+    drives.rest()
+    assert stored_state(valid, drives.watch.now)["reference"]["counts"]
+
+
+def test_a_reading_that_fails_does_not_undo_the_loss_of_a_reference() -> None:
+    drives = Drives()
+    for reading in (RELEASED, SILENT, SILENT):
+        drives.reading = reading
+        drives.watch.ask()
+        drives.rest()
+    lost = {"counts": False, "known": True, "why_not": "released"}
+    assert stored_state(StoredState(None, True, None), drives.watch.now)["reference"] == lost
+
+
+def test_drives_that_another_program_commands_are_reported_as_in_use() -> None:
+    """The page said "At rest" while it showed the other program's set-points."""
+    drives = Drives()
+    words = "another program sends set-points to drive 1"
+    drives.reading = replace(RELEASED, drives=None, missing=ForeignMaster(words, "bus"))
+    drives.rest()
+    read = drives.watch.now.as_dict()
+    assert read is not None
+    assert (read["why_not"], read["in_use"]) == (words, True)
+    assert words in none_found(THE_RIG.with_bus("socketcan", "can0"), drives.watch.now)
+    assert none_found(THE_RIG, RobotReport(None, None)) == "nothing moves"
+    drives.reading = SILENT
+    drives.watch.ask()
+    drives.rest()
+    assert not drives.watch.now.in_use
 
 
 def test_a_run_whose_cables_fit_no_pose_keeps_no_old_one() -> None:

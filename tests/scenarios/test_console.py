@@ -353,6 +353,7 @@ def test_a_stop_without_a_run_reports_it(on_a_day: Callable[[Day], None]) -> Non
 
 def nothing_to_stop(slow_rig: Path, bus: tuple[str, ...], folder: Path) -> None:
     with console(slow_rig, bus) as (_, address), operator(address) as me:
-        assert me.command("stop")["what"] == "nothing moves"
-        assert "nothing moves" in me.command("hold")["what"]
+        none_found = "no motion of this user was found: press the emergency stop if the robot moves"
+        assert me.command("stop")["what"] == none_found
+        assert "no motion of this user" in me.command("hold")["what"]
         assert "plan" in me.command("run", plan="")["what"]

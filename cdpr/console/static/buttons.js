@@ -31,7 +31,7 @@ const REQUIREMENTS = {
     if (state.motion?.state === "preparing") return "A motion is being prepared";
     return isActive(state.motion) ? "The platform is in motion" : null;
   },
-  moves: ({ state: { motion } }) => (motion && MOVING.includes(motion.state) ? null : "Nothing is moving"),
+  moves: ({ state: { motion } }) => (motion && MOVING.includes(motion.state) ? null : "No motion of this user is in progress"),
   path: ({ state }) => (isJogging(state) ? "A jog has no path: release the control to stop" : null),
   going: ({ state: { motion } }) => (motion.wished.stop || ["stopping", "securing"].includes(motion.state) ? "The run is stopping" : null),
   unheld: ({ state: { motion } }) => (motion.wished.hold ? "The run is already held" : null),

@@ -19,7 +19,7 @@ const LAMPS = {
     const text = !on && holding ? `${holding} of ${drives.length} drives hold` : `${on} of ${drives.length} drives on`;
     return [text, drives.some((d) => d.in_fault) ? "fail" : on === drives.length ? "pass" : on ? "stop" : "quiet"];
   },
-  homed: ({ reference }) => [reference.counts ? "Homed" : "Not homed", reference.counts ? "pass" : "stop"],
+  homed: ({ reference: { counts, known: isKnown } }) => [counts ? "Homed" : isKnown ? "Not homed" : "Homed: unknown", counts ? "pass" : "stop"],
   latch: ({ latched }) => (latched === null ? ["No fault", "pass"] : ["Fault latched", "fail"]),
 };
 
@@ -52,7 +52,7 @@ function troubleText(tensions, [low, high]) {
 
 /** The present motion, in a few words. */
 export function motionText(state) {
-  const { motion, busy, jog, cable, latched } = state;
+  const { motion, busy, jog, cable, latched, drives_read: read } = state;
   if (jog.ready) return jog.moving ? "Jogging" : "Ready to jog";
   if (cable.ready) return cable.moving ? `Jogging cable ${cable.cable}` : "Ready to jog a cable";
   if (motion) {
@@ -61,7 +61,17 @@ export function motionText(state) {
   }
   if (busy) return BEFORE[busy.verb] ?? busy.verb;
   if (isMovedByAnother(state)) return "Moved by another user";
+  if (read?.in_use) return "Used by another program";
   return latched === null ? "At rest" : "Fault latched";
+}
+
+/** What is known of the robot without a motion of this user: STOP reaches no other. */
+export function restText(state) {
+  const { busy, simulated, drives_read: read } = state;
+  if (busy) return "";
+  if (isMovedByAnother(state)) return `Process ${state.moved_by} of another user is not stopped from here.`;
+  if (read?.in_use) return `As last read, ${read.why_not}.`;
+  return simulated ? "Nothing is moving." : "No motion of this user is in progress.";
 }
 
 /** Largest age of a measured pose that is shown as current, [s]. */

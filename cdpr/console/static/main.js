@@ -1,6 +1,6 @@
 /* The console's page: creates its parts and passes each state to them. */
 
-import { applyButtons, guardButtons, isActive, isMovedByAnother } from "./buttons.js";
+import { applyButtons, guardButtons, isActive } from "./buttons.js";
 import { Connection } from "./connection.js";
 import { Curves } from "./curves.js";
 import { cancelDialog, checkDialog } from "./dialog.js";
@@ -49,7 +49,7 @@ const stopBar = bindStop(connection, () => {
   jog.end("STOP");
 }, () => {
   const { state, stale } = situation();
-  return !stale && !state.jog.ready && !state.cable.ready && !isActive(state.motion) && !isMovedByAnother(state);
+  return !stale && state.simulated && !state.jog.ready && !state.cable.ready && !isActive(state.motion);
 });
 const live = new Live(), curves = new Curves(), events = new Events(), pictures = new Pictures(), teach = new Teach(page), pick = new Pick(page), operate = new Operate(page), news = new News(page);
 const jog = bindJog(connection, situation, command);

@@ -11,10 +11,11 @@ const VERBS = { run: "Run", home: "Homing", reset: "Reset", release: "Release", 
 const DISMISSED = "cdpr dismissed outcome";
 
 /** The line of a verb's output with the result: the last that is neither indented nor a report. */
-export function headline(text) {
+function headline({ text, stopped }) {
   const lines = text.trim().split("\n");
   const found = lines.findLast((line) => /^\S/.test(line) && !line.startsWith("report:")) ?? lines.at(-1);
-  const sentence = found.replace(/^(STOPPED|PASSED|FAILED) +(?=\S)/, "").trim();
+  const verdict = stopped ? /^(STOPPED|PASSED|FAILED|error:) +(?=\S)/ : /^(STOPPED|PASSED|FAILED) +(?=\S)/;
+  const sentence = found.replace(verdict, "").trim();
   return sentence === found.trim() ? sentence : capital(sentence);
 }
 
@@ -87,7 +88,7 @@ export class News {
     if (!outcome) memory.write((this.#dismissed = null));
     this.#outcome = text;
     if (!outcome) return;
-    const title = titleOf(outcome, preview), head = headline(outcome.text);
+    const title = titleOf(outcome, preview), head = headline(outcome);
     write(at("outcome-title"), title);
     write(at("outcome-full").querySelector("h2"), title);
     write(at("outcome-headline"), head);

@@ -5,7 +5,7 @@ import { address } from "./connection.js";
 import { PlanCurves } from "./curves.js";
 import { ask } from "./dialog.js";
 import { at, chosen, duration, exact, known, make, mark, write } from "./elements.js";
-import { motionText } from "./live.js";
+import { motionText, restText } from "./live.js";
 
 export class Operate {
   plan = null; // the loaded plan, from /api/preview
@@ -85,7 +85,8 @@ export class Operate {
     at("plan-look").hidden = !(this.plan?.moments.length > 1) || isActive(motion);
     if (this.#busy && !busy) this.readFiles();
     this.#busy = busy?.verb ?? null;
-    write(at("homed-text"), state.reference.counts ? "The drives are homed." : `Not homed: ${state.reference.why_not || "reason unknown"}.`);
+    const { counts, known: isKnown, why_not: why } = state.reference;
+    write(at("homed-text"), counts ? "The drives are homed." : `${isKnown ? "Not homed" : "Homed: unknown"}: ${why || "reason unknown"}.`);
   }
 
   #motion(state) {
@@ -95,7 +96,7 @@ export class Operate {
     if (along !== null) {
       at("progress").value = along;
       write(at("progress-text"), `${known(motion.path_mm, 0)} of ${known(motion.path_length_mm, 0, "mm")} · ${duration(motion.elapsed_s)} · feed ${known(motion.feed_percent, 0)} %`);
-    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : state.busy ? "" : "Nothing is moving.");
+    } else write(at("progress-text"), motion ? duration(motion.elapsed_s) : restText(state));
     write(at("motion-cause"), motion?.cause ?? "");
     const asked = motion?.wished.speed_percent;
     if (asked !== undefined && !this.#sliding && !this.#sending) {
@@ -206,7 +207,7 @@ export class Operate {
       "Only tensions and speed are checked; obstacles, workspace and pose are not. The platform may move, tilt or drop.",
       make("p", { class: "cause" }, make("b", {}, "Homing: "), reference.counts
         ? "the reference stays valid, as the drives keep counting. No run starts while their positions match no pose; wind back, or home again."
-        : "the drives are not homed. Home them afterwards."),
+        : reference.known ? "the drives are not homed. Home them afterwards." : "unknown, as the drives could not be read."),
     ];
     if (await this.#confirmed("cable_begin", { title: "Enable the drives for single cables?", lines, confirm: "Enable the drives" })) this.#page.command("cable_begin");
   }

@@ -3,16 +3,17 @@
 It acts on pointerdown, and on the space bar and Escape outside text fields, before any other handler. It is an
 operational stop, in black as IEC 60204-1 prefers, not an emergency stop. */
 
+import { isActive } from "./buttons.js";
 import { at, isTextField, write } from "./elements.js";
 
 const ANSWER_MS = 6000; // an answer is shown for this time
 const SILENT_MS = 1000; // without an answer by then, the operator is warned
 const STOPPING = "Stopping along the path";
 
-/** Binds STOP; `pressed()` is called before each is sent; `atRest()` is true while nothing is known to move. */
+/** Binds STOP; `pressed()` is called before each is sent; `atRest()` is true while nothing can move. */
 export function bindStop(connection, pressed, atRest) {
   const button = at("stop"), answer = at("stop-answer");
-  let presses = 0;
+  let presses = 0, moved = false;
 
   function fail(text) {
     write(answer, text);
@@ -33,6 +34,7 @@ export function bindStop(connection, pressed, atRest) {
     const harmless = ok || atRest();
     write(answer, what || "Stop requested");
     answer.classList.toggle("failed", !harmless);
+    // Any other answer stays, until the next press, a press on it, or a motion of this user.
     if (harmless) setTimeout(() => press === presses && write(answer, ""), ANSWER_MS);
   }
 
@@ -42,6 +44,10 @@ export function bindStop(connection, pressed, atRest) {
   });
   button.addEventListener("click", (event) => {
     if (event.detail === 0) stop(); // Enter or a screen reader: no pointerdown came before
+  });
+  answer.addEventListener("click", () => {
+    write(answer, "");
+    answer.classList.remove("failed");
   });
   const isStop = (event) => [" ", "Escape"].includes(event.key) && !event.isComposing && !isTextField(event.target);
   window.addEventListener("keydown", (event) => {
@@ -63,13 +69,16 @@ export function bindStop(connection, pressed, atRest) {
     if (event.key === "Enter" && event.target instanceof HTMLInputElement && ["checkbox", "radio"].includes(event.target.type)) event.target.click();
   });
   return {
-    /** Shows the run's response. */
+    /** Shows the run's response; a run that begins supersedes an answer that found none. */
     show: (motion) => {
+      const begins = isActive(motion) && !moved;
+      moved = isActive(motion);
       const asked = motion?.wished.stop && !["finished", "stopped", "latched"].includes(motion.state);
       button.classList.toggle("asked", Boolean(asked));
       if (button.classList.contains("pressed")) return;
       if (asked) write(answer, STOPPING);
-      else if (answer.textContent === STOPPING) write(answer, "");
+      else if (begins || answer.textContent === STOPPING) write(answer, "");
+      if (asked || begins) answer.classList.remove("failed");
     },
   };
 }
