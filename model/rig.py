@@ -138,8 +138,8 @@ class Rig(ReadOnly):
             does not state it.
         outlet_error: Error of outlets along any axis, 95 %, [m]; None as above.
         anchor_error: As `outlet_error`, for anchors.
-        platform_error: Error of the pose that fits the cable lengths, 95 %, at any point of the
-            platform along any axis, [m]; None as above.
+        platform_error: Error of the platform's position by cable lengths, along any axis, 95 %,
+            [m]; None as above.
     """
 
     document: RigDocument

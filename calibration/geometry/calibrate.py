@@ -220,35 +220,15 @@ class RigCalibration:
             As by `RigUncertainty.worst`, and the parts that errors common to all measured poses
             and errors of measured tensions cause, shape (k,) each, [m].
         """
-        by_values, found = self._moved(positions, rotations)[:, :3], self.uncertainty
+        there = _sent_to(self.rig, positions, rotations)
+        line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
+        moved = -np.linalg.pinv(line.by_pose) @ line.by_values
+        by_values, found = moved[:, :3], self.uncertainty
         return (
             found.worst(by_values),
             found.worst_by_common(by_values),
             found.worst_by_tensions(by_values),
         )
-
-    def platform_error(self, tilt: float) -> float:
-        """Error of any point of the platform in the workspace, rotations included, 95 %, [m].
-
-        Args:
-            tilt: Largest rotation from the orientation at home, [rad].
-        """
-        points = np.vstack([self.rig.platform_corners, self.rig.anchors])
-        worst = 0.0
-        for angle in {0.0, tilt}:
-            positions, rotations = workspace_poses(self.rig, angle)
-            moved = self._moved(positions, rotations)
-            for arms in np.einsum("kij,pj->pki", rotations, points):
-                by_values = moved[:, :3] + np.cross(moved[:, 3:], arms[:, :, None], axis=1)
-                worst = max(worst, float(self.uncertainty.worst(by_values).max()))
-        return worst
-
-    def _moved(self, positions: Array, rotations: Array) -> Array:
-        """Derivatives of commanded poses by the parameters, shape (k, 6, p), [m, rad]."""
-        there = _sent_to(self.rig, positions, rotations)
-        line = RigModel(self.parameters, there).linearised(self.fit.values, positions, rotations)
-        moved: Array = -np.linalg.pinv(line.by_pose) @ line.by_values
-        return moved
 
     def reached(self, positions: Array, rotations: Array) -> Array:
         """Positions that the platform reaches when the rig file's parameters command poses.

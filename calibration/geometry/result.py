@@ -45,9 +45,6 @@ class RigResult(ResultDocument):
     anchors_error_mm: AnyNonNegative | None = Field(
         default=None, description="of their coordinates, 95 %, RMS; null: not calibrated"
     )
-    platform_error_mm: AnyNonNegative | None = Field(
-        default=None, description="of any point of the platform, rotated by up to tilt_deg, 95 %"
-    )
     pulley_radius_mm: Positive | None
     drums_mm_per_rev: list[Positive]
     stiffness_n: Positive = Field(description="E·A of a cable, or the mean where they differ")
@@ -139,8 +136,7 @@ class RigResult(ResultDocument):
             )
         keys = ("outlets_error_mm", "anchors_error_mm")
         stated = {key: value for key in keys if (value := getattr(self, key)) is not None}
-        if self.platform_error_mm != rig.platform_error_mm:
-            stated["platform_error_mm"] = self.platform_error_mm
+        stated["platform_error_mm"] = max(self.level_mm, self.turned_mm)
         return self._with_numbers(rig).model_copy(update=stated)
 
     def _is_applied(self, rig: RigDocument) -> bool:
@@ -230,7 +226,6 @@ def rig_result(result: RigCalibration, quality: RigQuality, name: str, on: date)
         **numbers,
         outlets_error_mm=_millimetres(result.error_of("outlets")),
         anchors_error_mm=_millimetres(result.error_of("anchors")),
-        platform_error_mm=_millimetres(result.platform_error(quality.tilt)),
         home_counts=_home_counts(result, numbers),
         groups=list(result.parameters.groups),
         not_identified=result.not_identified,

@@ -170,7 +170,7 @@ def tension_noise(rig: Rig, tensions: Array) -> Array:
 def encoder_covariance(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) -> Array:
     """Covariance of a pose that fits the cable lengths from the encoders.
 
-    The rig's `platform_error`, which every point of the platform has, counts as one of position.
+    The rig's `platform_error` is part of that of the position.
 
     Args:
         pose: ``world_from_platform``.

@@ -188,15 +188,12 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
 
 
 def test_rotated_poses_of_a_reflector_are_not_asked_to_be_rotated(rig: Rig, truth: Truth) -> None:
-    """Its tracker does not measure the rotations. The error includes them at the corners."""
+    """Its tracker does not measure the rotations."""
     found = fit_rig(rig, followed(truth, REFLECTOR), DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
     quality = judge_rig(found, 1e-5, np.radians(5.0))
     steps = " ".join(quality.verdict.next_steps)
     assert "measure the platform's rotation as well" in steps
     assert "measure with the platform rotated" not in steps
-    result = rig_result(found, quality, "rig", TODAY)
-    assert result.platform_error_mm is not None
-    assert result.platform_error_mm >= max(result.level_mm, result.turned_mm)
 
 
 def test_no_data_at_all_are_bad_input(rig: Rig) -> None:
