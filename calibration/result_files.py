@@ -69,7 +69,7 @@ def write_calibrated_rig(
     """Writes a new rig file with results applied to a rig; returns the new rig.
 
     Comments of the rig's own file are not copied; comments at its top name the results, and each
-    ``error_mm`` that a new lens leaves out.
+    error that a new lens leaves out.
 
     Args:
         path: The file to write; an existing file is never replaced.

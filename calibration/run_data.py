@@ -133,8 +133,14 @@ def rig_measurements(
             the origin when left out.
 
     Raises:
-        BadInput: A file cannot be read, is of another rig, or is named twice.
+        BadInput: A file cannot be read, is of another rig, or is named twice; or there is none.
     """
+    if not data:
+        raise BadInput(
+            "`data=` names no run folder and no CSV file",
+            where="calibrate rig",
+            next_step="check the folder from which they are listed",
+        )
     _require_once(data)
     runs = [(str(path), RunFolder.open(path).rig()) for path in data if is_folder(path)]
     counted = require_same_nominal(rig, runs)

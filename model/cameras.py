@@ -229,7 +229,7 @@ def lens_remarks(own: CameraDocument, new: CameraDocument, file: str, assumed: s
         remarks.append(f"{file}: {doubt}")
     what = f"the pose of camera {own.name!r} was found with another lens"
     remarks.append(f"{what}; calibrate it with `cdpr calibrate extrinsics`")
-    return remarks + left_out_errors([own], [new])
+    return remarks + _left_out_operator_error(own, new)
 
 
 def _scaled(rows: list[list[float]] | None, scales: Array) -> Array | None:
@@ -284,6 +284,8 @@ class FinishedCalibration(Protocol):
         """As written to the file."""
 
 
+_OF_THE_RIG = ("rig", "tags")
+"""Kinds of which a rig has one result: its name is free."""
 Result = TypeVar("Result", bound=CalibrationResult)
 
 
@@ -302,17 +304,17 @@ def corrected(
     document: RigDocument, results: Sequence[CalibrationResult], listener: Listener
 ) -> RigDocument:
     """A rig file's content with results applied; as `Rig.with_calibration`."""
-    seen: dict[tuple[str, str], str] = {}
+    seen: dict[tuple[str, str], CalibrationResult] = {}
     for result in results:
-        what = (result.kind, result.name)
-        if what in seen:
+        what = (result.kind, "" if result.kind in _OF_THE_RIG else result.name)
+        if first := seen.get(what):
+            both = f"{first.name!r} of {first.date} and {result.name!r} of {result.date}"
             raise BadInput(
-                f"two results of kind {result.kind} for {result.name!r}:"
-                f" {seen[what]} and {result.date}",
+                f"two results of kind {result.kind}: {both}",
                 where="--calibration, in Python rig.with_calibration()",
                 next_step="pass only the current one",
             )
-        seen[what] = result.date
+        seen[what] = result
     better = document
     for result in in_order(results):
         better = result.corrected(better)
@@ -326,16 +328,32 @@ def corrected(
 
 
 def left_out_errors(before: Sequence[CameraDocument], after: Sequence[CameraDocument]) -> list[str]:
-    """Remarks on operators' errors that a new lens left out: they were stated for another one.
+    """Remarks on errors that a new lens left out: they were stated for another one.
 
     Args:
         before: The cameras with their former lenses.
         after: The same cameras in the same order.
     """
+    pairs = list(zip(before, after, strict=True))
+    remarks = [
+        f"the pose of camera {own.name!r} was found with another lens, so its error is left out;"
+        " calibrate it with `cdpr calibrate extrinsics`"
+        for own, new in pairs
+        if lacks_pose_error(own, new)
+    ]
+    return remarks + [remark for own, new in pairs for remark in _left_out_operator_error(own, new)]
+
+
+def lacks_pose_error(own: CameraDocument, new: CameraDocument) -> bool:
+    """Whether a new lens left out the error of a camera's pose."""
+    return own.pose_covariance is not None and new.pose_covariance is None
+
+
+def _left_out_operator_error(own: CameraDocument, new: CameraDocument) -> list[str]:
+    if own.error_mm is None or new.error_mm is not None:
+        return []
     return [
         f"error_mm of camera {own.name!r}, {own.error_mm:g}, was stated for another lens and is"
         " left out; unless calibrations state all errors, state it again in a rig file with the new"
         " lens"
-        for own, new in zip(before, after, strict=True)
-        if own.error_mm is not None and new.error_mm is None
     ]

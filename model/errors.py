@@ -155,6 +155,11 @@ _OTHERS = {
     "Board": "a cdpr.Chessboard, or another board of `calibration`",
     "Camera": "rig.camera(), or rig.camera(name)",
     "Survey": "a calibration.Survey, or leave it out",
+    "StopDocument": "some of scene.document.stops, or stops in a scene's keys: Scene.from_dict("
+    "{**scene.as_dict(), 'stops': [{'name': 'a', 'position_mm': [0, 0, 400]}]})",
+    "Payload": "one in a scene's keys: Scene.from_dict("
+    "{**scene.as_dict(), 'load': {'payload_kg': 1.0}})",
+    "Supervisor": "an object of a subclass of executor.supervision.Supervisor, or leave it out",
 }
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -211,6 +212,10 @@ class Pose(ReadOnly):
     position: Array
     rotation: Array
 
+    if TYPE_CHECKING:
+
+        def __init__(self, position: ArrayLike, rotation: ArrayLike) -> None: ...
+
     def __post_init__(self) -> None:
         """Copies the arrays and makes them read-only."""
         object.__setattr__(self, "position", _floats(self.position, "position"))
@@ -294,8 +299,22 @@ class Pose(ReadOnly):
         return 2.0 * math.atan2(z, w)
 
     def apply(self, points: ArrayLike) -> Array:
-        """Maps points, shape (..., 3), [m], of the inner frame into the outer one."""
-        return np.asarray(floats_of(points) @ self.rotation.T + self.position)
+        """Maps points, shape (..., 3), [m], of the inner frame into the outer one.
+
+        Raises:
+            BadInput: They are something else.
+        """
+        try:
+            given = floats_of(points)
+        except (TypeError, ValueError):
+            given = np.empty(0)
+        if given.shape[-1:] != (3,):
+            raise BadInput(
+                f"points must be numbers of shape (..., 3): {str(points)[:60]}",
+                where="Pose.apply(points)",
+                next_step="pass x, y and z of each point, in metres",
+            )
+        return np.asarray(given @ self.rotation.T + self.position)
 
     def compose(self, other: Pose) -> Pose:
         """``a_from_b.compose(b_from_c)`` is ``a_from_c``."""
@@ -349,30 +368,6 @@ def step_between(before: Pose, after: Pose) -> Array:
     """Shift [m] and rotation [rad] along the outer frame's axes, shape (6,); inverts `moved`."""
     turn = rotation_vector_from_matrix(after.rotation @ before.rotation.T)
     return np.concatenate([after.position - before.position, turn])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlatformMotion:
-    """A steady motion of the platform.
-
-    Attributes:
-        velocity: Of its origin, world frame, shape (3,), [m/s].
-        turning: Angular velocity, world axes, shape (3,), [rad/s].
-    """
-
-    velocity: Array
-    turning: Array
-
-    @classmethod
-    def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
-        """The motion from one pose to another in a non-zero time."""
-        twist = step_between(before, after) / seconds
-        return cls(twist[:3], twist[3:])
-
-    def moved(self, pose: Pose, seconds: float) -> Pose:
-        """The pose at a later or earlier time."""
-        turn = matrix_from_rotation_vector(self.turning * seconds)
-        return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
 
 
 # Limits on the platform's tilt and turn, exact along whole moves.

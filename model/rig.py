@@ -48,7 +48,7 @@ __all__ = [
 #: Parts of a rig file that a plan's proof does not depend on; they may change after planning.
 NOT_IN_PLAN_HASH = (
     *("description", "bus", "drives", "tags", "cameras", "motion", "winches"),
-    *("simulation", "outlets_error_mm", "anchors_error_mm"),
+    *("simulation", "outlets_error_mm", "anchors_error_mm", "platform_error_mm"),
 )
 
 
@@ -138,6 +138,8 @@ class Rig(ReadOnly):
             does not state it.
         outlet_error: Error of outlets along any axis, 95 %, [m]; None as above.
         anchor_error: As `outlet_error`, for anchors.
+        platform_error: Error of the platform's position by cable lengths, along any axis, 95 %,
+            [m]; None as above.
     """
 
     document: RigDocument
@@ -165,6 +167,7 @@ class Rig(ReadOnly):
     tag_error: float | None = None
     outlet_error: float | None = None
     anchor_error: float | None = None
+    platform_error: float | None = None
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Rig:
@@ -311,8 +314,8 @@ class Rig(ReadOnly):
 
         Args:
             results: From calibration functions or `calibration.load_result`, in any order.
-            listener: Receives a remark for each ``error_mm`` that a new lens leaves out, and for
-                each result that is not good enough.
+            listener: Receives a remark for each error that a new lens leaves out, and for each
+                result that is not good enough.
 
         Raises:
             BadInput: A result does not fit this rig, two calibrate the same thing, or this rig is
@@ -399,6 +402,7 @@ def rig_from_document(document: RigDocument) -> Rig:
         tag_error=_metres(tags.error_mm if tags else None),
         outlet_error=_metres(document.outlets_error_mm),
         anchor_error=_metres(document.anchors_error_mm),
+        platform_error=_metres(document.platform_error_mm),
     )
 
 

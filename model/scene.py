@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from model.errors import BadInput, path_of, real_number, require_types
+from model.errors import BadInput, path_of, real_number, require_types, sequence_of
 from model.files.documents import (
     Document,
     PoseDocument,
@@ -188,7 +188,7 @@ class Scene(ReadOnly):
         """
         document = self.document
         require_unaltered(self)
-        require_types(optional=((start, Pose), (goal, Pose)))
+        require_types(optional=((start, Pose), (goal, Pose), (payload, Payload)))
         if clearance is not None:
             clearance = real_number("clearance", clearance, "m")
         if clearance is not None and not 0.0 <= clearance < np.inf:
@@ -202,7 +202,9 @@ class Scene(ReadOnly):
             value = {"obstacle_mm": round(clearance * 1000.0, 9)}
             update["clearance"] = document.clearance.model_copy(update=value)
         if stops is not None:
-            update["stops"] = list(stops)
+            given = sequence_of("stops", stops)
+            require_types(*((stop, StopDocument) for stop in given))
+            update["stops"] = list(given)
         if payload is not None:
             update["load"] = document.load.carrying(payload)
         return scene_from_document(document.model_copy(update=update))

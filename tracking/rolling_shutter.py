@@ -18,8 +18,8 @@ import numpy as np
 from model.cameras import Z_95
 from model.pose import (
     Array,
-    PlatformMotion,
     Pose,
+    matrix_from_rotation_vector,
     moved,
     read_only,
     step_between,
@@ -37,6 +37,30 @@ APART = 2.0
 PASSES = 2
 #: Step of the motion for finite differences, [m/s] and [rad/s].
 _STEP = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlatformMotion:
+    """A steady motion of the platform.
+
+    Attributes:
+        velocity: Of its origin, world frame, shape (3,), [m/s].
+        turning: Angular velocity, world axes, shape (3,), [rad/s].
+    """
+
+    velocity: Array
+    turning: Array
+
+    @classmethod
+    def between(cls, before: Pose, after: Pose, seconds: float) -> PlatformMotion:
+        """The motion from one pose to another in a non-zero time."""
+        twist = step_between(before, after) / seconds
+        return cls(twist[:3], twist[3:])
+
+    def moved(self, pose: Pose, seconds: float) -> Pose:
+        """The pose at a later or earlier time."""
+        turn = matrix_from_rotation_vector(self.turning * seconds)
+        return Pose(pose.position + self.velocity * seconds, turn @ pose.rotation)
 
 
 class RecentMotion:

@@ -23,9 +23,10 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from model.pose import Array, Pose, matrix_from_rotation_vector, rotation_vector_from_matrix
 from model.rig import Rig, load_rig
 from model.scene import load_scene
-from simulation.camera.camera import PlatformMotion, SyntheticCamera
+from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tracking.measurement import PoseMeasurement
+from tracking.rolling_shutter import PlatformMotion
 from tracking.tracker import Tracker
 
 CONFIGS = Path(__file__).parents[2] / "configs"

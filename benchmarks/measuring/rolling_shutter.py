@@ -20,12 +20,13 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tracking.measurement import PoseMeasurement
+from tracking.rolling_shutter import PlatformMotion
 from tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]

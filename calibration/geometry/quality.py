@@ -261,9 +261,14 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
                 f"rotated by {math.degrees(tilt):.3g}°, the platform may be off by"
                 f" {beyond(rotated, wanted)}",
                 _shared_cause(rotated, *rotated_parts)
-                or f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
-                " (`cdpr calibrate poses` plans it); if it never rotates, pass --tilt-deg 0, in"
-                " Python tilt=0",
+                or (
+                    f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
+                    " (`cdpr calibrate poses` plans it)"
+                    if result.measured.has_rotation.any()
+                    else "measure the platform's rotation as well (camera, or several reflectors),"
+                    f" or at more poses rotated by ±{math.degrees(tilt):.3g}° or more"
+                )
+                + "; if it never rotates, pass --tilt-deg 0, in Python tilt=0",
             )
         )
     error = max(missed, level, rotated)

@@ -14,7 +14,14 @@ from calibration.geometry.quality import RigQuality
 from calibration.results import ResultDocument, common_keys
 from calibration.statistics import Interval
 from model.errors import BadInput, Fault
-from model.files.documents import AnyNonNegative, AnyNumber, Finding, Positive, Vector
+from model.files.documents import (
+    AnyNonNegative,
+    AnyNumber,
+    Finding,
+    Positive,
+    Vector,
+    content_hash,
+)
 from model.files.rig_file import RigDocument
 from model.pose import Array
 from model.rig import Rig, rig_from_document
@@ -112,8 +119,14 @@ class RigResult(ResultDocument):
         """The rig file's content with these values.
 
         Raises:
-            BadInput: The result is of another rig.
+            BadInput: The result is of another rig, or applied already.
         """
+        if self._is_applied(rig):
+            raise BadInput(
+                "this result is applied already: the rig has its values",
+                where=f"calibration {self.kind} {self.name}, {self.date}",
+                next_step="leave it out",
+            )
         self.require_basis(nominal_geometry(rig), _WHAT)
         if len(self.outlets_mm) != len(rig.winches):
             raise BadInput(
@@ -121,7 +134,20 @@ class RigResult(ResultDocument):
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="run `cdpr calibrate rig` again; the rig file was changed since",
             )
-        better = _with_numbers(
+        keys = ("outlets_error_mm", "anchors_error_mm")
+        stated = {key: value for key in keys if (value := getattr(self, key)) is not None}
+        stated["platform_error_mm"] = max(self.level_mm, self.turned_mm)
+        return self._with_numbers(rig).model_copy(update=stated)
+
+    def _is_applied(self, rig: RigDocument) -> bool:
+        """Whether a rig that it changes has its values; home counts change with `cdpr home`."""
+        parts = nominal_geometry(rig)
+        if self.rests_on == content_hash(parts) or len(self.outlets_mm) != len(rig.winches):
+            return False
+        return nominal_geometry(self._with_numbers(rig)) == parts
+
+    def _with_numbers(self, rig: RigDocument) -> RigDocument:
+        return _with_numbers(
             rig,
             self.outlets_mm,
             self.anchors_mm,
@@ -131,12 +157,6 @@ class RigResult(ResultDocument):
             self.cable_stiffness_n,
             [round(home) for home in self.home_counts],
         )
-        stated = {
-            key: getattr(self, key)
-            for key in ("outlets_error_mm", "anchors_error_mm")
-            if getattr(self, key) is not None
-        }
-        return better.model_copy(update=stated)
 
 
 def _with_numbers(

@@ -32,13 +32,13 @@ from model.files.camera_file import Readout
 from model.files.documents import AnyNonNegative, Positive
 from model.files.reading import is_folder
 from model.files.rig_file import RigDocument
-from model.pose import Array, PlatformMotion, Pose
+from model.pose import Array, Pose
 from model.progress import Listener
 from model.rig import Camera, Rig
 from tracking.camera_model import Image
 from tracking.measurement import MEMORY
 from tracking.pnp import TagView, refine_pnp, solve_pnp
-from tracking.rolling_shutter import correct_rolling_shutter
+from tracking.rolling_shutter import PlatformMotion, correct_rolling_shutter
 
 LEAST = 5
 """Minimum number of images with a known motion; fewer do not show the scatter."""

@@ -283,7 +283,8 @@ class CameraResult(ResultDocument):
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with this camera's parameters.
 
-        Errors stated for another lens are left out: the pose's and the operator's ``error_mm``.
+        With another lens, the errors stated for the former one are left out: the pose's and the
+        operator's ``error_mm``.
 
         Raises:
             BadInput: The rig has no camera of this name, or one of another size.
@@ -298,9 +299,9 @@ class CameraResult(ResultDocument):
             )
         keys = ("fx_px", "fy_px", "cx_px", "cy_px", "distortion", "lens", "lens_covariance")
         lens = {k: getattr(self, k) for k in keys}
-        left_out: dict[str, None] = {"pose_by_lens": None, "pose_covariance": None}
-        if any(getattr(camera, key) != value for key, value in lens.items()):
-            left_out["error_mm"] = None
+        if all(getattr(camera, key) == value for key, value in lens.items()):
+            return rig
+        left_out = dict.fromkeys(("pose_by_lens", "pose_covariance", "error_mm"))
         return with_camera(rig, camera.model_copy(update=lens | left_out))
 
 

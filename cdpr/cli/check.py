@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 
 from cdpr.cli.arguments import argument, option
-from cdpr.cli.options import JSON
+from cdpr.cli.options import CALIBRATION, JSON, calibrated_rig, require_unused
 from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from drivers.stopping_distance import stopping_remarks
 from executor.recording.verdict import fault_titles, page_of_fault
@@ -22,6 +22,7 @@ def check(
     *,
     plan: Path = argument("plan file (JSON)", "PLAN"),
     rig: Path | None = option("also require that the plan fits this rig file"),
+    calibration: list[Path] | None = CALIBRATION,
     as_json: bool = JSON,
 ) -> None:
     """Verify a plan independently: distances at dense poses, with bounds in between.
@@ -33,7 +34,10 @@ def check(
       cdpr check plan.json --rig configs/gachon_8_6.yaml --json
     """
     the_plan = load_plan(plan)
-    the_rig = the_plan.rig if rig is None else load_rig(rig)
+    if rig is None:
+        why = "without --rig, the rig in the plan is used, with the calibration it was made with"
+        require_unused("cdpr check", {"--calibration": calibration}, why)
+    the_rig = the_plan.rig if rig is None else calibrated_rig(load_rig(rig), calibration)
     require_same_rig(the_plan, the_rig, plan)
     terminal = Terminal(quiet=as_json)
     terminal.remarks(the_plan.scene.remarks(the_rig))

@@ -21,6 +21,7 @@ from executor.recording.table_files import (
     texts,
 )
 from executor.recording.tables import CycleTable
+from model.cameras import Z_95
 from model.clearance import ClearanceModel, Nearest
 from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Array, Pose
@@ -137,7 +138,7 @@ def no_clearance(obstacles: tuple[str, ...] = ()) -> ClearanceTable:
     )
 
 
-# Accuracy of the encoder pose: resolution of the counts, and stretch from noisy torques.
+# Accuracy of the encoder pose: resolution of the counts, stretch from noisy torques, and geometry.
 
 
 #: Ratio of the standard deviation of a normal distribution to the median of its absolute values.
@@ -169,6 +170,8 @@ def tension_noise(rig: Rig, tensions: Array) -> Array:
 def encoder_covariance(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) -> Array:
     """Covariance of a pose that fits the cable lengths from the encoders.
 
+    The rig's `platform_error` is part of that of the position.
+
     Args:
         pose: ``world_from_platform``.
         noise: See `tension_noise`, shape (m,), [N].
@@ -181,6 +184,7 @@ def encoder_covariance(winches: WinchMap, rig: Rig, pose: Pose, noise: Array) ->
     lengths = np.hypot(counts, whole / winches.stiffness * noise)
     spread = np.linalg.pinv(structure_matrix(rig, pose).T) * lengths
     covariance: Array = spread @ spread.T
+    covariance[:3, :3] += ((rig.platform_error or 0.0) / Z_95) ** 2 * np.eye(3)
     return covariance
 
 

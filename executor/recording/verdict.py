@@ -117,7 +117,7 @@ def judge(
         following(cycles, rig.motion.following_error),
         replies(cycles, context),
         *tensions(cycles, rig),
-        *distances(clearance, scene.obstacle_clearance, course.cameras, began),
+        *distances(clearance, scene.obstacle_clearance, course.cameras, began, rig.platform_error),
         *encoder_pose(cycles),
         *camera(poses, course.cameras, began),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
@@ -275,16 +275,19 @@ def distances(
     required: float,
     cameras: Sequence[CameraRecord] = (),
     path_began: float = 0.0,
+    platform_error: float | None = None,
 ) -> list[Check]:
     """Checks of the clearance against the scene's and, for cameras, the planned one.
 
     A distance fails only if it is too small by more than its uncertainty. Each of several cameras
     counts alone as well, so that none hides what another one measures. Distances before the time
     ``path_began`` [s] have no planned ones: the platform is beside the start, by the tolerance.
+    Intervals of the encoders leave out the rig's geometry if its ``platform_error`` is None.
     """
     checks = []
     alone = sorted(filter(None, map(camera_of, {*clearance.source})))
-    names = {"tag": _camera_phrase(cameras), "encoder": "the encoders"}
+    exact = ", taking the rig's geometry as exact" if platform_error is None else ""
+    names = {"tag": _camera_phrase(cameras), "encoder": f"the encoders{exact}"}
     names |= {source_of(camera): f"camera {camera} alone" for camera in alone}
     for source, source_name in names.items():
         rows = clearance.of(source)

@@ -31,7 +31,7 @@ from executor.remote.command_socket import advertised_ahead, is_stopped_since
 from executor.remote.protocol import StatusSource, answer_to, status_answer
 from executor.remote.status import NO_PATH, MotionStatus
 from executor.supervision import LocalRequests, RequestBoard, Supervisor, ctrl_c_interrupts
-from model.errors import CdprError, StoppedByOperator, require_child_processes
+from model.errors import CdprError, StoppedByOperator, require_child_processes, require_types
 from model.rig import Rig
 
 #: Largest length of a request, [bytes].
@@ -286,6 +286,7 @@ def commands_from_start(
         BadInput: The motion needs a process of its own, which this one cannot start.
         SystemExit: This process still imports the script of another, which lacks the guard.
     """
+    require_types(optional=[(supervisor, Supervisor)])
     require_imported_script()
     if realtime:
         require_child_processes("drives in real time")

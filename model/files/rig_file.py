@@ -30,6 +30,9 @@ from model.files.simulation_file import SimulationDocument
 Period = Annotated[int, Field(ge=1, le=1000)]
 Identity = Annotated[int, Field(ge=0, le=0xFFFFFFFF)]
 FileName = Annotated[str, Field(min_length=1)]
+PositionError = Annotated[
+    NonNegative | None, Field(description="of any such position, 95 %; calibrations write it")
+]
 
 
 STIFFEST_N = 1e9
@@ -232,12 +235,9 @@ class RigDocument(Document):
     workspace: WorkspaceDocument
     outlets_mm: Annotated[list[Vector], *_one_a_cable]
     anchors_mm: Annotated[list[Vector], *_one_a_cable]
-    outlets_error_mm: NonNegative | None = Field(
-        default=None, description="position error of any of them, 95 %; calibrations write it"
-    )
-    anchors_error_mm: NonNegative | None = Field(
-        default=None, description="position error of any of them, 95 %; calibrations write it"
-    )
+    outlets_error_mm: PositionError = None
+    anchors_error_mm: PositionError = None
+    platform_error_mm: PositionError = None
     cables: CableDocument
     pulleys: PulleysDocument | None = None
     winches: Annotated[list[WinchDocument], *_one_a_cable]

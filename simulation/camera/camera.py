@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from model.errors import BadInput
 from model.kinematics import cables_at
-from model.pose import Array, PlatformMotion, Pose
+from model.pose import Array, Pose
 from model.rig import Camera, Rig
 from model.scene import Scene
 from simulation.camera.cables import draw_cables
@@ -35,6 +35,7 @@ from simulation.camera.rendering import (
 )
 from simulation.ground_truth import Optics
 from tracking.camera_model import encoded, pixels_of, rays_of
+from tracking.rolling_shutter import PlatformMotion
 
 if TYPE_CHECKING:
     from simulation.camera.rendering import Image8

@@ -629,7 +629,7 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
         *("plan " + name for name in ("from_run", "clearance", "mode", "max_iterations")),
         *("waypoints waypoints", "waypoints stops", "waypoints author"),
         *("workspace_map " + name for name in ("slices", "step", "rotation", "workers")),
-        *("changed start", "changed goal", "changed clearance"),
+        *("changed " + name for name in ("start", "goal", "clearance", "stops", "payload")),
         *("calibrate_rig " + name for name in (*NUMBERS_OF_A_FIT, "deviations")),
         *("calibrate_rig pose_deviations", "calibrate_rig reflector"),
         *("calibrate_camera " + name for name in ("wanted", "distance", "lens", "name")),
@@ -689,6 +689,11 @@ def test_a_wrong_argument_is_named_with_its_value(
         (lambda: cdpr.workspace_map(rig, slices=[("xy", 0.1)]), "('xy', 0.1) is not a slice"),
         (lambda: cdpr.workspace_map(rig, rotation=np.ones((3, 3))), "not a rotation"),
         (lambda: cdpr.load_rig(None), "the path must be a str or a pathlib.Path, it is None"),
+        (lambda: scene.changed(payload=1.0), "expected a Payload, not float"),
+        (lambda: scene.changed(stops=[rig.home]), "expected a StopDocument, not Pose"),
+        (lambda: scene.changed(stops=[{"name": "a"}]), "expected a StopDocument, not dict"),
+        (lambda: scene.changed(stops="x"), "stops must be a list, it is 'x'"),
+        (lambda: cdpr.run(plan, rig, supervisor=3), "expected a Supervisor, not int"),
         (lambda: plan.save(3), "the path must be a str or a pathlib.Path, it is 3 (int)"),
     ):
         with pytest.raises(cdpr.BadInput, match=re.escape(text)):
@@ -704,6 +709,7 @@ def test_methods_refuse_arguments_of_another_type(rig: cdpr.Rig) -> None:
         (lambda: rig.tensions_by([1, 2]), "torques must be a number for each of 8 cables"),
         (lambda: rig.torques_by("x"), "tensions must be a number for each of 8 cables"),
         (lambda: rig.torques_by(["1"] * 8), "tensions must be a number for each of 8 cables"),
+        *((partial(rig.home.apply, x), "points must be numbers") for x in ([1, 2], None, 1.0, "x")),
         (lambda: cdpr.Pose.level(["1", "2", "3"]), "does not consist of numbers"),
         (lambda: cdpr.Pose.level(np.array(["1", "2", "3"])), "does not consist of numbers"),
         (lambda: cdpr.Pose.level([1.0 + 1.0j, 0.0, 0.0]), "does not consist of numbers"),

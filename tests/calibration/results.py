@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from datetime import date
 
-from calibration.geometry.result import RigResult
+from calibration.geometry.result import RigResult, nominal_geometry
 from calibration.intrinsics.result import CameraResult
 from calibration.results import CalibrationVerdict, common_keys
 from calibration.statistics import Interval
+from model.files.documents import content_hash
+from model.rig import Rig
 
 
 def camera_result_of(name: str = "front", fx: float = 905.0, size=(1280, 720)) -> CameraResult:
@@ -55,3 +57,20 @@ def rig_result_of(name: str = "rig") -> RigResult:
         reached_mm=[[0.0, 0.0, 100.0]],
         cable_residuals_mm=[0.1],
     )
+
+
+def rig_result_for(rig: Rig, name: str = "rig", by_mm: float = 0.1) -> RigResult:
+    """A result made with a rig's file, with the first outlet moved along x."""
+    document = rig.document
+    outlets = [list(point) for point in document.outlets_mm]
+    outlets[0][0] += by_mm
+    basis = {"rests_on": content_hash(nominal_geometry(document))}
+    cables = {
+        "outlets_mm": outlets,
+        "anchors_mm": document.anchors_mm,
+        "drums_mm_per_rev": [winch.drum_mm_per_rev for winch in document.winches],
+        "home_counts": [float(winch.home_counts) for winch in document.winches],
+        "cable_residuals_mm": [0.1] * rig.cable_count,
+        "stiffness_n": document.cables.stiffness_n,
+    }
+    return rig_result_of(name).model_copy(update=basis | cables)

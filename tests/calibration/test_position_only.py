@@ -187,6 +187,21 @@ def test_a_file_of_positions_needs_no_rotation_and_half_of_one_is_refused(
             read_rig_data(half, 8)
 
 
+def test_rotated_poses_of_a_reflector_are_not_asked_to_be_rotated(rig: Rig, truth: Truth) -> None:
+    """Its tracker does not measure the rotations."""
+    found = fit_rig(rig, followed(truth, REFLECTOR), DEFAULT_DEVIATIONS, LENGTH_DEVIATION)
+    quality = judge_rig(found, 1e-5, np.radians(5.0))
+    steps = " ".join(quality.verdict.next_steps)
+    assert "measure the platform's rotation as well" in steps
+    assert "measure with the platform rotated" not in steps
+
+
+def test_no_data_at_all_are_bad_input(rig: Rig) -> None:
+    """As from a misspelt pattern of run folders."""
+    with pytest.raises(BadInput, match="names no run folder and no CSV file"):
+        calibrate_rig(rig, [])
+
+
 def parallel_cables(rig: Rig) -> Rig:
     """A rig of 3.1 x 2.3 x 2.2 m with uncrossed cables, which hardly resist rotation about z."""
     document, corners = rig.document, [(x, y) for y in (1, -1) for x in (-1, 1)]

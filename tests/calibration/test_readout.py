@@ -15,13 +15,14 @@ from calibration.intrinsics.readout import _motion_at, open_timed_images, readou
 from calibration.procedures import measure_readout
 from calibration.result_files import load_result
 from model.errors import BadInput
-from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector
 from model.progress import Listener
 from model.rig import Rig, load_rig
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics
 from tests.cli.program import call, one_message
+from tracking.rolling_shutter import PlatformMotion
 
 RIG = Path(__file__).parents[2] / "configs" / "gachon_8_6.yaml"
 TRUE, RATE = 0.025, 20.0

@@ -21,7 +21,7 @@ from calibration.results import Calibration, CalibrationVerdict, Issue, write_re
 from calibration.statistics import Interval
 from model.errors import BadInput
 from model.rig import Rig, load_rig, rig_from_document
-from tests.calibration.results import camera_result_of
+from tests.calibration.results import camera_result_of, rig_result_for
 from tests.calibration.test_camera_files_of_others import Remarks
 from tracking.clearance import require_stated_errors
 
@@ -82,8 +82,25 @@ def test_a_pose_found_with_another_lens_states_no_error(rig: Rig) -> None:
     )
     known = rig_from_document(rig.document.model_copy(update={"cameras": [document]}))
     assert known.cameras[0].pose_covariance is not None
-    camera = known.with_calibration(camera_result_of()).cameras[0]
+    remarks = Remarks([])
+    camera = known.with_calibration(camera_result_of(), listener=remarks).cameras[0]
     assert (camera.pose_covariance, camera.pose_by_lens) == (None, None)
+    (remark,) = (text for text in remarks.texts if "error_mm" not in text)
+    assert remark.startswith("the pose of camera 'front' was found with another lens")
+    assert "`cdpr calibrate extrinsics`" in remark
+
+
+def test_the_lens_that_a_rig_has_already_leaves_its_pose_as_calibrated(rig: Rig) -> None:
+    """As where a script passes `--calibration` of the lens that was applied to the file."""
+    better = rig.with_calibration(camera_result_of())
+    posed = better.document.cameras[0].model_copy(
+        update={"pose_covariance": np.eye(6).tolist(), "pose_by_lens": np.zeros((6, 9)).tolist()}
+    )
+    known = rig_from_document(better.document.model_copy(update={"cameras": [posed]}))
+    remarks = Remarks([])
+    again = known.with_calibration(camera_result_of(), listener=remarks)
+    assert again.document == known.document
+    assert remarks.texts == []
 
 
 def test_an_error_stated_for_another_lens_is_left_out(rig: Rig) -> None:
@@ -130,8 +147,38 @@ def test_a_result_for_another_camera_is_refused(rig: Rig, result, named: str) ->
 
 
 def test_two_results_of_one_camera_are_refused(rig: Rig) -> None:
-    with pytest.raises(BadInput, match="two results of kind camera for 'front'"):
+    with pytest.raises(BadInput, match="two results of kind camera: 'front' of"):
         rig.with_calibration(camera_result_of(), camera_result_of(fx=901.0))
+
+
+def test_two_results_of_a_rig_are_refused_whatever_their_names(rig: Rig) -> None:
+    one, other = rig_result_for(rig, "camera"), rig_result_for(rig, "tracker", by_mm=0.2)
+    with pytest.raises(BadInput, match="two results of kind rig: 'camera' of") as caught:
+        rig.with_calibration(one, other)
+    assert caught.value.next_step == "pass only the current one"
+
+
+def test_a_result_that_the_rig_file_has_already_is_refused_as_that(rig: Rig) -> None:
+    result = rig_result_for(rig)
+    better = rig.with_calibration(result)
+    with pytest.raises(BadInput, match="this result is applied already") as caught:
+        better.with_calibration(result)
+    assert caught.value.next_step == "leave it out"
+    with pytest.raises(BadInput, match="made with outlets"):
+        better.with_calibration(rig_result_for(rig, by_mm=0.2))
+
+
+@pytest.mark.parametrize(("level", "turned"), [(1.4, 1.2), (0.3, 1.4)])
+def test_the_stated_error_of_the_platform_goes_into_the_rig(
+    rig: Rig, level: float, turned: float
+) -> None:
+    """Which keeps its plans: their proof does not depend on it."""
+    assert rig.platform_error is None
+    stated = {"level_mm": level, "turned_mm": turned}
+    better = rig.with_calibration(rig_result_for(rig).model_copy(update=stated))
+    assert better.platform_error == pytest.approx(1.4e-3)
+    without = better.document.model_copy(update={"platform_error_mm": None})
+    assert rig_from_document(without).plan_hash == better.plan_hash
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import yaml
 
 from calibration.result_files import load_result
 from calibration.results import write_result
 from model.rig import load_rig
-from tests.calibration.results import camera_result_of
+from tests.calibration.results import camera_result_of, rig_result_for
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message
 
@@ -23,6 +25,35 @@ def test_a_plan_is_made_for_the_calibrated_rig(tmp_path: Path) -> None:
     assert answer.code == 0, answer
     rig = json.loads((tmp_path / "plan.json").read_text())["rig"]
     assert rig["cameras"][0]["fx_px"] == 905.0
+
+
+def test_a_plan_for_a_calibrated_rig_is_checked_against_its_file_with_the_calibration(
+    tmp_path: Path,
+) -> None:
+    """As the refusal without it asks."""
+    result = write_result(tmp_path, rig_result_for(load_rig(Path(RIG))))
+    plan = tmp_path / "plan.json"
+    made = call("plan", RIG, SCENE, "-o", plan, "--calibration", result, "--rounds", "1")
+    assert made.code == 0, made
+    one_message(call("check", plan, "--rig", RIG), 2, "pass the same --calibration here")
+    answer = call("check", plan, "--rig", RIG, "--calibration", result)
+    assert answer.code == 0, answer
+    one_message(call("check", plan, "--calibration", result), 2, "no effect here: --calibration")
+
+
+def test_the_next_step_after_a_new_lens_is_the_pose_of_the_camera(tmp_path: Path) -> None:
+    rig = load_rig(Path(RIG))
+    posed = rig.document.cameras[0].model_copy(update={"pose_covariance": np.eye(6).tolist()})
+    document = rig.document.model_copy(update={"cameras": [posed]})
+    old, new = tmp_path / "old.yaml", tmp_path / "new.yaml"
+    plain = document.model_dump(mode="json", exclude_unset=True)
+    old.write_text(yaml.safe_dump(plain), encoding="utf-8")
+    result = write_result(tmp_path, camera_result_of())
+    answer = call("calibrate", "apply", old, result, "-o", new)
+    assert answer.code == 0, answer
+    step = f"next `cdpr calibrate extrinsics {new} SOURCE --camera front`"
+    assert step in " ".join(answer.out.split())
+    assert "# the pose of camera 'front' was found with another lens" in new.read_text("utf-8")
 
 
 @pytest.mark.parametrize("verb", ["plan", "run", "home", "track"])

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 
 from executor.recording.clearance import encoder_covariance, tension_noise
+from model.clearance import ClearanceModel
 from model.kinematics import cable_lengths, forward_kinematics
 from model.pose import Array, Pose, rotation_vector_from_matrix
 from model.rig import Rig, load_rig, rig_from_document
+from model.scene import load_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
-from tests.cli.plans import RIG
+from tests.cli.plans import CONFIGS, RIG
+from tracking.clearance import clearance_at
 
 
 def soft(stiffness_n: float) -> Rig:
@@ -59,6 +62,23 @@ def test_soft_cables_and_noisy_torques_make_it_worse() -> None:
     assert worst(stiff, 0.5) < 0.1e-3
     assert worst(weak, 0.5) > 5.0 * worst(stiff, 0.5)
     assert worst(weak, 5.0) > 5.0 * worst(weak, 0.5)
+
+
+def test_the_error_of_a_calibrated_rig_is_in_the_interval_of_the_platform() -> None:
+    """At every point of the platform, in every direction."""
+    rig = load_rig(Path(RIG))
+    stated = rig_from_document(rig.document.model_copy(update={"platform_error_mm": 1.4}))
+    noise = np.full(rig.cable_count, 0.5)
+    known, exact = (
+        encoder_covariance(WinchMap(one), one, rig.home, noise) for one in (stated, rig)
+    )
+    own = 1.96**2 * np.diag(exact)[:3]
+    assert 1.96**2 * np.diag(known)[:3] == pytest.approx(own + 1.4e-3**2, rel=1e-6)
+    assert known[3:] == pytest.approx(exact[3:])
+    model = ClearanceModel(stated, load_scene(CONFIGS / "environment_1.yaml"))
+    clearance = clearance_at(model, rig.home, known, 0.0)
+    assert clearance is not None
+    assert clearance.uncertainty >= 1.4e-3
 
 
 def test_noise_is_taken_from_what_changes_between_cycles() -> None:

@@ -402,6 +402,14 @@ def test_a_clearance_fails_only_when_too_small_beyond_its_uncertainty(
     assert (float(upper) >= 10.0) is passed, "a verdict contradicts its own figures"
 
 
+@pytest.mark.parametrize("source", ["tag", "encoder"])
+@pytest.mark.parametrize("error", [None, 1.4e-3])
+def test_an_interval_that_leaves_out_the_geometry_says_so(source: str, error: float | None) -> None:
+    check = distances(rows(source, 20.0, 0.1, 20.0), 0.010, platform_error=error)[0]
+    is_exact = ", taking the rig's geometry as exact: 20.0 mm" in check.text
+    assert is_exact is (source == "encoder" and error is None)
+
+
 def test_a_clearance_measured_just_before_the_start_is_at_zero() -> None:
     """By the camera's latency."""
     measured = rows("tag", 20.0, 0.0, 9.0)

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.pose import Array, PlatformMotion, Pose, matrix_from_rotation_vector
+from model.pose import Array, Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig
 from model.scene import Scene, empty_scene
 from simulation.camera.camera import ImageSequence, SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
+from tracking.rolling_shutter import PlatformMotion
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 DISTANCE, FOCAL = 0.4, 900.0

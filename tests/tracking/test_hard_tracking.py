@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from drivers.cameras.live import Frame
-from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, Tag
 from model.scene import Scene
 from simulation.camera.camera import Optics, SyntheticCamera
@@ -23,7 +23,7 @@ from tracking.detection.tags import tag_corners
 from tracking.estimator import PlatformEstimator, find_consensus
 from tracking.measurement import NoPose, PoseMeasurement, TrackerSettings, predict, rejection_reason
 from tracking.pnp import TagView, solve_pnp
-from tracking.rolling_shutter import RecentMotion
+from tracking.rolling_shutter import PlatformMotion, RecentMotion
 from tracking.track import NoPlatformSeen, track
 from tracking.tracker import Tracker
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.pose import PlatformMotion, Pose, matrix_from_rotation_vector
+from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import Camera, Rig, load_rig, rig_from_document
 from model.scene import empty_scene
 from simulation.camera.camera import SyntheticCamera
 from simulation.ground_truth import Optics, camera_as_built
 from tracking.camera_model import pixels_of
 from tracking.measurement import PoseMeasurement
-from tracking.rolling_shutter import RecentMotion
+from tracking.rolling_shutter import PlatformMotion, RecentMotion
 from tracking.tracker import Tracker
 
 READOUT, RATE = 0.03, 20.0

@@ -17,6 +17,7 @@ from cdpr.cli.arguments import argument, flag, option, required
 from cdpr.cli.options import CALIBRATION, JSON, RIG, calibrated_rig
 from cdpr.cli.output import Terminal, present, show_facts, show_json
 from drivers.plausibility import HOMING_OPTIONS
+from model.cameras import lacks_pose_error
 from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
@@ -107,12 +108,17 @@ def apply(
       cdpr calibrate apply rig.yaml calibration_rig_rig_2026-03-14.yaml -o rig_calibrated.yaml
     """
     loaded = [load_result(path) for path in results]
-    new = write_calibrated_rig(output, load_rig(rig), loaded, Terminal())
+    old = load_rig(rig)
+    new = write_calibrated_rig(output, old, loaded, Terminal())
     facts = [(f"{one.kind} {one.name}", f"{one.date}: {one.verdict}") for one in loaded]
+    facts.append(("rig file", str(output)))
+    path = quote(str(output))
     facts += [
-        ("rig file", str(output)),
-        ("next", f"`cdpr home {quote(str(output))}` with {HOMING_OPTIONS}, then plan with it"),
+        ("next", f"`cdpr calibrate extrinsics {path} SOURCE --camera {quote(camera.name)}`")
+        for camera, changed in zip(old.document.cameras, new.document.cameras, strict=True)
+        if lacks_pose_error(camera, changed)
     ]
+    facts.append(("next", f"`cdpr home {path}` with {HOMING_OPTIONS}, then plan with it"))
     document = {"rig": str(output), "results": [str(path) for path in results]}
     present(as_json, document, f"{new.name} with its calibration", facts)
 
