@@ -386,8 +386,7 @@ def locate_camera_by_another(
         require_tags(rig, None)
     else:
         require_oriented(board)
-    to = Destination.of(output)
-    to.require_free("extrinsics", located.name)
+    to = Destination.of(output).require_free("extrinsics", located.name)
     ready_to_measure(listener)
     seen: list[dict[str, BodyObservation]] = []
     unused: dict[str, str] = {}
