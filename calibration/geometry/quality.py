@@ -81,6 +81,13 @@ _ROUND_OFF = 1e-9
 def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, Array] | None:
     """Changes of compliances, relative to the rig file's, that the data ask for.
 
+    With u the unknowns of the fit, c the compliances and the poses eliminated, one step solves
+
+        N_uu du + N_uc dc = 0    (the fit has settled)
+        N_cu du + N_cc dc = −p   (p: half the gradient of the squares by c)
+
+    so S dc = −p with S = N_cc − N_cu N_uu⁻¹ N_uc, and the covariance of dc is S⁻¹.
+
     Args:
         groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
@@ -91,13 +98,44 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     """
     if not np.isfinite(result.measured.tensions).all():
         return None
+    information, gradient, with_all_known = _compliance_information(result, groups)
+    r = len(information) - groups.shape[1]
+    by_free = np.linalg.solve(information[:r, :r], information[:r, r:])
+    schur = information[r:, r:] - information[r:, :r] @ by_free
+    scale = np.sqrt(with_all_known)
+    if not scale.all() or np.linalg.eigvalsh(schur / np.outer(scale, scale))[0] < _ROUND_OFF:
+        return None
+    change = -np.asarray(np.linalg.solve(schur, gradient))
+    covariance = result.uncertainty.scatter * np.linalg.inv(schur)
+    # Bias by errors of the tensions, from the squares that these changes leave.
+    squares, nominal = result.uncertainty.tension_squares, _nominal_compliance(result)
+    left = max(1.0 + float(gradient @ change) / squares.sum(), 0.0) if squares.any() else 0.0
+    by_share = left * squares / np.maximum(nominal + groups @ change, LEAST_SHARE * nominal)
+    by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
+    free_scores = result.observability.known.T @ result.parameters.tension_scores(by_logarithm)
+    biased = np.linalg.solve(schur, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
+    # Errors of tensions only make cables seem stiffer.
+    explained = np.where(change < 0.0, biased, 0.0)
+    return change, covariance + np.outer(explained, explained)
+
+
+def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Array, Array, Array]:
+    """Information on the fit's r unknowns and q compliances, the poses eliminated.
+
+    Args:
+        groups: 1 where a cable is in a group of one compliance, shape (m, q).
+
+    Returns:
+        The information, shape (r + q, r + q), prior of the unknowns included; half the gradient of
+        the squares by the compliances, shape (q,); the information on each of them with all else
+        known, shape (q,).
+    """
     data, fit, parameters = result.measured, result.fit, result.parameters
     model = RigModel(parameters, data)
     line = model.linearised(fit.values, fit.positions, fit.rotations)
-    m = result.rig.cable_count
     by_shares = -model.counted.by_compliance(result.geometry) / result.rig.cable_stiffness
     by_compliance = np.zeros((*line.residuals.shape, groups.shape[1]))
-    by_compliance[:, :m] = by_shares[..., None] * groups
+    by_compliance[:, : result.rig.cable_count] = by_shares[..., None] * groups
     free = parameters.deviations[:, None] * result.observability.known
     by_all = np.concatenate([line.by_values @ free, by_compliance], axis=2)
     weights = fit.weights / fit.deviations**2
@@ -108,27 +146,10 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     gained = np.linalg.solve(poses, np.swapaxes(mixed, 1, 2))
     information = np.einsum("nmp,nm,nmq->pq", by_all, weights, by_all)
     information -= np.einsum("npi,niq->pq", mixed, gained)
-    r = free.shape[1]
+    information[: free.shape[1], : free.shape[1]] += np.eye(free.shape[1])
+    gradient = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
     with_all_known = np.einsum("nmp,nm,nmp->p", by_compliance, weights, by_compliance)
-    information[:r, :r] += np.eye(r)
-    by_free = np.linalg.solve(information[:r, :r], information[:r, r:])
-    own = information[r:, r:] - information[r:, :r] @ by_free
-    scale = np.sqrt(with_all_known)
-    if not scale.all() or np.linalg.eigvalsh(own / np.outer(scale, scale))[0] < _ROUND_OFF:
-        return None
-    pull = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
-    change = -np.asarray(np.linalg.solve(own, pull))
-    covariance = result.uncertainty.scatter * np.linalg.inv(own)
-    # Bias by errors of the tensions, from the squares that these changes leave.
-    squares, nominal = result.uncertainty.tension_squares, _nominal_compliance(result)
-    left = max(1.0 + float(pull @ change) / squares.sum(), 0.0) if squares.any() else 0.0
-    by_share = left * squares / np.maximum(nominal + groups @ change, LEAST_SHARE * nominal)
-    by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
-    free_scores = result.observability.known.T @ parameters.tension_scores(by_logarithm)
-    biased = np.linalg.solve(own, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
-    # Errors of tensions only make cables seem stiffer.
-    explained = np.where(change < 0.0, biased, 0.0)
-    return change, covariance + np.outer(explained, explained)
+    return information, gradient, with_all_known
 
 
 # The verdict.
