@@ -20,6 +20,7 @@ from calibration.extrinsics.result import (
     ExtrinsicCalibration,
     ExtrinsicsOutcome,
     judged_extrinsics,
+    nearest_to_median,
     scaled_to,
     widths_of,
     workspace_corners,
@@ -299,9 +300,9 @@ class _PairsFit:
 
 def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> _PairsFit:
     """The best ``reference_from_camera``, with the noise from the residuals if that is larger."""
-    guesses = [b.camera_from_body.compose(a.camera_from_body.inverse()) for a, b in observed]
-    middle = np.median([guess.position for guess in guesses], axis=0)
-    start = min(guesses, key=lambda guess: float(np.linalg.norm(guess.position - middle)))
+    start = nearest_to_median(
+        [b.camera_from_body.compose(a.camera_from_body.inverse()) for a, b in observed]
+    )
     turn = np.kron(np.eye(2), start.rotation)
     covariances = [far.covariance + turn @ near.covariance @ turn.T for near, far in observed]
     whitening = np.linalg.inv(np.linalg.cholesky(covariances))
