@@ -29,7 +29,7 @@ from model.pose import Array
 from model.progress import SILENT, Listener
 from model.rig import Camera
 from planner.settings import whole_number
-from tracking.camera_model import Image
+from tracking.camera_model import Image, rms
 
 STILL_PX = 0.7
 """RMS motion of the corners from one image to the next, for images of 1000 px."""
@@ -168,7 +168,7 @@ def _still(before: DetectedBoard, now: DetectedBoard, size: tuple[int, int]) -> 
     ]
     if len(pairs) < len(now.points) / 2:
         return False
-    motion = float(np.sqrt(np.mean(np.sum(np.square(pairs), axis=1))))
+    motion = float(rms(np.array(pairs)))
     return motion < STILL_PX * size[0] / 1000.0
 
 

@@ -50,7 +50,7 @@ from calibration.results import (
 )
 from calibration.run_data import poses_by_image, require_reflector_used, rig_measurements
 from calibration.tag_map.bundle_adjustment import TagLayout, measure_layout, require_tags
-from calibration.tag_map.observations import observe_tags
+from calibration.tag_map.observations import TagObservations, observe_tags
 from calibration.tag_map.result import (
     TagsResult,
     judge_layout,
@@ -60,6 +60,7 @@ from calibration.tag_map.result import (
 )
 from calibration.targets.boards import Board, read_corners
 from executor.kernels import ready_to_measure
+from model.cameras import Camera, Tag
 from model.errors import (
     BadInput,
     Fault,
@@ -115,8 +116,7 @@ def calibrate_camera(
     wanted, distance = _required(wanted, distance, lens)
     require_file_name(name, "`name=`")
     source = folder if isinstance(folder, ImageSet) else open_images(path_of(folder))
-    to = Destination.of(output)
-    to.require_free("camera", name)
+    to = Destination.of(output).require_free("camera", name)
     with source.reported("detecting the board", listener) as images:
         found = fit_camera(images, board, source.unused, lens)
     if board.needs_lens:
@@ -155,8 +155,7 @@ def calibrate_camera_from_corners(
     if len(sides) != 2:
         raise BadInput(f"size must be the width and height of the images in px, it is {size!r}")
     width, height = (whole_number("size", side, 1) for side in sides)
-    to = Destination.of(output)
-    to.require_free("camera", name)
+    to = Destination.of(output).require_free("camera", name)
     found = fit_corners(*read_corners(path_of(corners)), (width, height), lens, str(corners))
     return _judged_camera(found, name, wanted, distance, to)
 
@@ -222,17 +221,23 @@ def locate_camera(
     if known is None:
         require_frame_tags(rig)
     tags = rig.frame_tags if known is None else rig.platform_tags
-    opened, to = open_source(source, taken_by, pictures, DEFAULT_IMAGES), Destination.of(output)
-    to.require_free("extrinsics", taken_by.name)
-    ready_to_measure(listener)
-    with opened.reported("detecting tags", listener) as images:
-        numbers = [tag.id for tag in tags]
-        observations = observe_tags(images, rig, taken_by, numbers, opened.unused)
+    opened = open_source(source, taken_by, pictures, DEFAULT_IMAGES)
+    to = Destination.of(output).require_free("extrinsics", taken_by.name)
+    observations = _observed(rig, taken_by, tags, opened, listener)
     if known is None:
         found = locate_by_frame_tags(rig, taken_by, observations, survey or Survey(0.5e-3, None))
     else:
         found = locate_by_motion(rig, taken_by, observations, known)
     return judged_extrinsics(found, rig, taken_by, wanted, to)
+
+
+def _observed(
+    rig: Rig, camera: Camera, tags: Sequence[Tag], opened: ImageSet, listener: Listener
+) -> TagObservations:
+    """Corners of the tags in all images."""
+    ready_to_measure(listener)
+    with opened.reported("detecting tags", listener) as images:
+        return observe_tags(images, rig, camera, [tag.id for tag in tags], opened.unused)
 
 
 def locate_tags(
@@ -269,12 +274,9 @@ def locate_tags(
     taken_by = rig.camera(camera)
     require_file_name(rig.name, "name")
     require_tags(rig, fixed_tag)
-    opened, to = open_source(source, taken_by, pictures, DEFAULT_TAG_IMAGES), Destination.of(output)
-    to.require_free("tags", rig.name)
-    ready_to_measure(listener)
-    with opened.reported("detecting tags", listener) as images:
-        numbers = [tag.id for tag in rig.platform_tags]
-        observations = observe_tags(images, rig, taken_by, numbers, opened.unused)
+    opened = open_source(source, taken_by, pictures, DEFAULT_TAG_IMAGES)
+    to = Destination.of(output).require_free("tags", rig.name)
+    observations = _observed(rig, taken_by, rig.platform_tags, opened, listener)
     found = measure_layout(rig, taken_by, observations, fixed_tag)
     verdict = judge_layout(found, wanted)
     result = tags_result(found, verdict, rig.document, to.on)
@@ -320,12 +322,8 @@ def measure_readout(
     require_tags(rig, None)
     rolling = replace(taken_by, readout=taken_by.readout or inf)  # takes no rotated images
     pictures, known = open_timed_images(path_of(source), rolling, rate, listener)
-    to = Destination.of(output)
-    to.require_free("readout", taken_by.name)
-    ready_to_measure(listener)
-    with pictures.reported("detecting tags", listener) as images:
-        numbers = [tag.id for tag in rig.platform_tags]
-        observations = observe_tags(images, rig, taken_by, numbers, pictures.unused)
+    to = Destination.of(output).require_free("readout", taken_by.name)
+    observations = _observed(rig, taken_by, rig.platform_tags, pictures, listener)
     times = {name: known[name] for name in observations.squares}
     found = fit_readout(rig, taken_by, observations, times)
     verdict = judge_readout(found, wanted, speed)
@@ -405,8 +403,7 @@ def calibrate_rig(
     if without_poses:
         measured = measured.without_poses()
     require_reflector_used(measured, measured_point)
-    to = Destination.of(output)
-    to.require_free("rig", name)
+    to = Destination.of(output).require_free("rig", name)
     with listener.waiting("fitting"):
         try:
             found = fit_rig(counted, measured, deviations, length_deviation)

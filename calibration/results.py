@@ -352,16 +352,17 @@ class Destination:
             return output
         return cls(None if output is None else path_of(output))
 
-    def require_free(self, kind: str, name: str) -> None:
-        """Creates the folder before the computation, so that no work is lost.
+    def require_free(self, kind: str, name: str) -> Destination:
+        """Itself, its folder created before the computation, so that no work is lost.
 
         Raises:
             BadInput: It cannot be created or written to, or holds such a result or report.
         """
         if self.folder is None:
-            return
+            return self
         result = self.folder / result_file_name(kind, name, self.on.isoformat())
         if self.folder.is_dir():
             for file in (result, result.with_suffix(".html")):
                 require_new_file(file, self.replace)
         make_missing_folder(self.folder)
+        return self

@@ -292,23 +292,23 @@ def settled_poses_near(
         twists = -np.linalg.solve(damped, slopes[..., None])[..., 0]
         turns = np.reshape([matrix_from_rotation_vector(v) for v in twists[:, 3:]], (-1, 3, 3))
         ahead: tuple[Array, ...] = (positions + twists[:, :3], turns @ rotations)
-        exists = cables_exist(rig, _anchors_at(rig, *ahead))
-        ahead = _chosen(exists, ahead, here)
+        exists = cables_exist(rig, anchors_at(rig, *ahead))
+        ahead = chosen_rows(exists, ahead, here)
         ahead += _squares_near(rig, lengths, *ahead)
         better = exists & (ahead[2] <= squares)
-        here = _chosen(better, ahead, here)
+        here = chosen_rows(better, ahead, here)
         damping = np.clip(damping * np.where(better, 0.5, 10.0), LEAST_DAMPING, _MOST_DAMPING)
         if np.abs(twists).max(initial=0.0) < tolerance:
             break
     return here[0], here[1]
 
 
-def _anchors_at(rig: Rig, positions: Array, rotations: Array) -> Array:
+def anchors_at(rig: Rig, positions: Array, rotations: Array) -> Array:
     """Anchors at n poses, world frame, shape (n, m, 3), [m]."""
     return np.asarray(positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors))
 
 
-def _chosen(
+def chosen_rows(
     first: NDArray[np.bool_], one: tuple[Array, ...], other: tuple[Array, ...]
 ) -> tuple[Array, ...]:
     """Arrays with a row per pose, each row of one of two; ``first`` shape (n,)."""
@@ -329,7 +329,7 @@ def _squares_near(
     Returns:
         Shapes (n,), (n, 6) and (n, 6, 6).
     """
-    cables = cables_to(rig, _anchors_at(rig, positions, rotations))
+    cables = cables_to(rig, anchors_at(rig, positions, rotations))
     matrices, errors = structure_matrix_of(cables, positions), cables.lengths - lengths
     arms, shares = cables.anchors - positions[:, None, :], errors / cables.lengths
     by_twist = np.zeros((*arms.shape, 6))

@@ -203,7 +203,7 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
         error: Of its corners, 95 %, RMS, [m].
     """
     arms = tag_corners(tag) - tag.pose.position
-    reach = float(np.sqrt(np.mean(np.sum(arms**2, axis=1))))
+    reach = float(rms(arms))
     shift = error / Z_95 / np.sqrt(6.0)
     turn = error / Z_95 / (2.0 * reach)
     return np.array([np.hstack([shift * np.eye(3), -turn * skew(arm)]) for arm in arms])

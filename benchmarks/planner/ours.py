@@ -13,7 +13,7 @@ from model.rig import Rig
 from model.scene import Scene
 from planner.anytime.path import advance, handle_of, sampled_path
 from planner.anytime.problem import problem_of
-from planner.anytime.state import BEST, AnytimeSearch, Handle, new_search
+from planner.anytime.state import BEST, TESTS_BEFORE, AnytimeSearch, Handle, new_search
 from planner.costs import KinematicCost
 from planner.kernels.jit import kernel
 from planner.settings import Weights
@@ -115,12 +115,12 @@ def _many(handle: Handle, times: int) -> int:
     """Searches for a first path ``times`` times; returns how often one was found."""
     found = 0
     for _ in range(times):
-        handle.search.grown[:] = 0
-        handle.search.made[:] = 0
+        handle.search.trees.counts[:] = 0
+        handle.search.roadmap.made[:] = 0
         if first_path(handle) > 0:
             found += 1
     return found
 
 
 def _checks(search: AnytimeSearch) -> int:
-    return int(search.totals[2] + search.counts[:, 1].sum())
+    return int(search.totals[TESTS_BEFORE] + search.counts[:, 1].sum())

@@ -20,6 +20,7 @@ from calibration.extrinsics.result import (
     ExtrinsicCalibration,
     ExtrinsicsOutcome,
     judged_extrinsics,
+    nearest_to_median,
     scaled_to,
     widths_of,
     workspace_corners,
@@ -299,9 +300,9 @@ class _PairsFit:
 
 def _fit(observed: Sequence[tuple[BodyObservation, BodyObservation]]) -> _PairsFit:
     """The best ``reference_from_camera``, with the noise from the residuals if that is larger."""
-    guesses = [b.camera_from_body.compose(a.camera_from_body.inverse()) for a, b in observed]
-    middle = np.median([guess.position for guess in guesses], axis=0)
-    start = min(guesses, key=lambda guess: float(np.linalg.norm(guess.position - middle)))
+    start = nearest_to_median(
+        [b.camera_from_body.compose(a.camera_from_body.inverse()) for a, b in observed]
+    )
     turn = np.kron(np.eye(2), start.rotation)
     covariances = [far.covariance + turn @ near.covariance @ turn.T for near, far in observed]
     whitening = np.linalg.inv(np.linalg.cholesky(covariances))
@@ -386,8 +387,7 @@ def locate_camera_by_another(
         require_tags(rig, None)
     else:
         require_oriented(board)
-    to = Destination.of(output)
-    to.require_free("extrinsics", located.name)
+    to = Destination.of(output).require_free("extrinsics", located.name)
     ready_to_measure(listener)
     seen: list[dict[str, BodyObservation]] = []
     unused: dict[str, str] = {}

@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from calibration.extrinsics.result import (
     SCALES,
     ExtrinsicCalibration,
+    nearest_to_median,
     scaled_to,
     widths_of,
     workspace_corners,
@@ -207,7 +208,9 @@ def locate_by_motion(
             next_step="take images at more poses, and list each in the pose file",
         )
     stack = _Stack.of(samples)
-    best = _reweighted_fit(stack, _initial_pose(samples), _NOMINAL, TAG_FRAME_DEVIATION)
+    guesses = [s.world_from_platform.compose(s.camera_from_tags.inverse()) for s in samples]
+    start = nearest_to_median(guesses)
+    best = _reweighted_fit(stack, start, _NOMINAL, TAG_FRAME_DEVIATION)
     scatter = np.asarray(np.linalg.inv(best.information))[:6, :6]
     without = [change[:6] for change in best.without_each(len(samples))]
     covariance = scaled_to(scatter, widths_of(scatter, without))
@@ -245,13 +248,6 @@ def _observe(
     return _PoseObservation(
         pose, seen, found.covariance, found.reprojection, tuple(squares), by_lens
     )
-
-
-def _initial_pose(samples: Sequence[_PoseObservation]) -> Pose:
-    """The camera's pose by the image that is nearest to the median of all."""
-    guesses = [s.world_from_platform.compose(s.camera_from_tags.inverse()) for s in samples]
-    middle = np.median([guess.position for guess in guesses], axis=0)
-    return min(guesses, key=lambda guess: float(np.linalg.norm(guess.position - middle)))
 
 
 def _reweighted_fit(

@@ -29,6 +29,7 @@ from model.files.documents import AnyNonNegative, PoseDocument, Vector
 from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, skew, step_between
 from model.rig import Camera, Rig
+from tracking.camera_model import rms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +128,12 @@ def judge_extrinsics(result: ExtrinsicCalibration, wanted: float) -> Calibration
     return CalibrationVerdict.of(error, wanted, "in the workspace", issues)
 
 
+def nearest_to_median(poses: Sequence[Pose]) -> Pose:
+    """The pose whose position is nearest to the median of all."""
+    middle = np.median([pose.position for pose in poses], axis=0)
+    return min(poses, key=lambda pose: float(np.linalg.norm(pose.position - middle)))
+
+
 def widths_of(covariance: Array, without: Sequence[Array]) -> Array:
     """Half widths of 95 % intervals, from scatter or jackknife.
 
@@ -204,7 +211,7 @@ class ExtrinsicsResult(ResultDocument):
         points = np.array(self.points_mm) / 1e3
         seen = self.world_from_camera.pose().inverse().apply(points)
         gaps = other.world_from_camera.pose().apply(seen) - points
-        return float(np.sqrt(np.mean(np.sum(gaps**2, axis=1)))) * 1e3
+        return float(rms(gaps)) * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with the camera at this pose.

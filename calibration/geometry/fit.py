@@ -11,7 +11,6 @@ from functools import cached_property
 from math import inf, radians
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calibration.geometry.measurements import RigMeasurements
 from calibration.geometry.model import RigModel
@@ -21,8 +20,10 @@ from model.errors import Fault
 from model.kinematics import (
     LEAST_DAMPING,
     NoCable,
+    anchors_at,
     cables_exist,
     cables_to,
+    chosen_rows,
     structure_matrix_of,
 )
 from model.pose import Array, matrix_from_rotation_vector, read_only, rotation_vector_from_matrix
@@ -345,27 +346,30 @@ def _nearest_poses(
 ) -> tuple[Array, Array]:
     """Damped least squares from given poses, each damped separately; see `_pose_systems`."""
     damping = np.full(len(lengths), 1e-3)
-    here = _pose_systems(rig, lengths, data, turn, poses)
-    squares, system = here[0], here[1:]
+    here: tuple[Array, ...] = (*poses, *_pose_systems(rig, lengths, data, turn, *poses))
     for _ in range(MOST_STEPS):
-        slopes, normal = system
+        positions, rotations, squares, slopes, normal = here
         damped = normal + damping[:, None, None] * normal * np.eye(6)
         twists = np.asarray(-np.linalg.solve(damped, slopes[..., None]))[..., 0]
-        trial = (poses[0] + twists[:, :3], _rotated(poses[1], twists[:, 3:]))
-        exists = cables_exist(rig, _anchors(rig, trial))
-        trial = _chosen(exists, trial, poses)
-        there = _pose_systems(rig, lengths, data, turn, trial)
-        better = exists & (there[0] <= squares)
-        poses, system = _chosen(better, trial, poses), _chosen(better, there[1:], system)
-        squares = np.where(better, there[0], squares)
+        ahead: tuple[Array, ...] = (positions + twists[:, :3], _rotated(rotations, twists[:, 3:]))
+        exists = cables_exist(rig, anchors_at(rig, *ahead))
+        ahead = chosen_rows(exists, ahead, here)
+        ahead += _pose_systems(rig, lengths, data, turn, *ahead)
+        better = exists & (ahead[2] <= squares)
+        here = chosen_rows(better, ahead, here)
         damping = np.clip(damping * np.where(better, 0.1, 10.0), LEAST_DAMPING, MOST_DAMPING)
         if np.abs(twists).max() < START_TOLERANCE:
             break
-    return poses
+    return here[0], here[1]
 
 
 def _pose_systems(
-    rig: Rig, lengths: Array, data: RigMeasurements, turn: float, poses: tuple[Array, Array]
+    rig: Rig,
+    lengths: Array,
+    data: RigMeasurements,
+    turn: float,
+    positions: Array,
+    rotations: Array,
 ) -> tuple[Array, Array, Array]:
     """Least squares by lengths, measured positions, and rotations from home.
 
@@ -374,14 +378,14 @@ def _pose_systems(
         lengths: From outlet to anchor, shape (n, m), [m].
         data: The samples, without rotations.
         turn: Standard deviation of rotations from home, [rad].
-        poses: Positions, shape (n, 3), [m], and rotations, shape (n, 3, 3).
+        positions: Shape (n, 3), [m].
+        rotations: Shape (n, 3, 3).
 
     Returns:
         Sums of squares, shape (n,), and their normal equations: half the gradient, shape (n, 6),
         and its slopes, shape (n, 6, 6).
     """
-    positions, rotations = poses
-    cables = cables_to(rig, _anchors(rig, poses))
+    cables = cables_to(rig, anchors_at(rig, positions, rotations))
     off = (cables.lengths - lengths) / START_DEVIATION
     by_twist = -structure_matrix_of(cables, positions) / START_DEVIATION
     apart, rotated = np.zeros((2, len(lengths), 6))
@@ -395,22 +399,6 @@ def _pose_systems(
     normal[:, 3:, 3:] += np.eye(3) / turn**2
     slopes = (by_twist @ off[..., None])[..., 0] + pulls + rotated / turn
     return squares, slopes, normal
-
-
-def _anchors(rig: Rig, poses: tuple[Array, Array]) -> Array:
-    """Anchors in the world at poses, shape (n, m, 3), [m]."""
-    positions, rotations = poses
-    return np.asarray(positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors))
-
-
-def _chosen(
-    first: NDArray[np.bool_], one: tuple[Array, Array], other: tuple[Array, Array]
-) -> tuple[Array, Array]:
-    """A vector and a matrix per sample, each of one of two sets; ``first`` shape (n,)."""
-    return (
-        np.where(first[:, None], one[0], other[0]),
-        np.where(first[:, None, None], one[1], other[1]),
-    )
 
 
 def _rotated(rotations: Array, turns: Array) -> Array:

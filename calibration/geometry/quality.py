@@ -10,6 +10,7 @@ narrow. Where the stiffness is among the parameters, its prior counts too.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -80,6 +81,13 @@ _ROUND_OFF = 1e-9
 def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, Array] | None:
     """Changes of compliances, relative to the rig file's, that the data ask for.
 
+    With u the unknowns of the fit, c the compliances and the poses eliminated, one step solves
+
+        N_uu du + N_uc dc = 0    (the fit has settled)
+        N_cu du + N_cc dc = −p   (p: half the gradient of the squares by c)
+
+    so S dc = −p with S = N_cc − N_cu N_uu⁻¹ N_uc, and the covariance of dc is S⁻¹.
+
     Args:
         groups: 1 where a cable is in a group of one compliance, shape (m, q).
 
@@ -90,13 +98,44 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     """
     if not np.isfinite(result.measured.tensions).all():
         return None
+    information, gradient, with_all_known = _compliance_information(result, groups)
+    r = len(information) - groups.shape[1]
+    by_free = np.linalg.solve(information[:r, :r], information[:r, r:])
+    schur = information[r:, r:] - information[r:, :r] @ by_free
+    scale = np.sqrt(with_all_known)
+    if not scale.all() or np.linalg.eigvalsh(schur / np.outer(scale, scale))[0] < _ROUND_OFF:
+        return None
+    change = -np.asarray(np.linalg.solve(schur, gradient))
+    covariance = result.uncertainty.scatter * np.linalg.inv(schur)
+    # Bias by errors of the tensions, from the squares that these changes leave.
+    squares, nominal = result.uncertainty.tension_squares, _nominal_compliance(result)
+    left = max(1.0 + float(gradient @ change) / squares.sum(), 0.0) if squares.any() else 0.0
+    by_share = left * squares / np.maximum(nominal + groups @ change, LEAST_SHARE * nominal)
+    by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
+    free_scores = result.observability.known.T @ result.parameters.tension_scores(by_logarithm)
+    biased = np.linalg.solve(schur, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
+    # Errors of tensions only make cables seem stiffer.
+    explained = np.where(change < 0.0, biased, 0.0)
+    return change, covariance + np.outer(explained, explained)
+
+
+def _compliance_information(result: RigCalibration, groups: Array) -> tuple[Array, Array, Array]:
+    """Information on the fit's r unknowns and q compliances, the poses eliminated.
+
+    Args:
+        groups: 1 where a cable is in a group of one compliance, shape (m, q).
+
+    Returns:
+        The information, shape (r + q, r + q), prior of the unknowns included; half the gradient of
+        the squares by the compliances, shape (q,); the information on each of them with all else
+        known, shape (q,).
+    """
     data, fit, parameters = result.measured, result.fit, result.parameters
     model = RigModel(parameters, data)
     line = model.linearised(fit.values, fit.positions, fit.rotations)
-    m = result.rig.cable_count
     by_shares = -model.counted.by_compliance(result.geometry) / result.rig.cable_stiffness
     by_compliance = np.zeros((*line.residuals.shape, groups.shape[1]))
-    by_compliance[:, :m] = by_shares[..., None] * groups
+    by_compliance[:, : result.rig.cable_count] = by_shares[..., None] * groups
     free = parameters.deviations[:, None] * result.observability.known
     by_all = np.concatenate([line.by_values @ free, by_compliance], axis=2)
     weights = fit.weights / fit.deviations**2
@@ -107,27 +146,10 @@ def _compliance_changes(result: RigCalibration, groups: Array) -> tuple[Array, A
     gained = np.linalg.solve(poses, np.swapaxes(mixed, 1, 2))
     information = np.einsum("nmp,nm,nmq->pq", by_all, weights, by_all)
     information -= np.einsum("npi,niq->pq", mixed, gained)
-    r = free.shape[1]
+    information[: free.shape[1], : free.shape[1]] += np.eye(free.shape[1])
+    gradient = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
     with_all_known = np.einsum("nmp,nm,nmp->p", by_compliance, weights, by_compliance)
-    information[:r, :r] += np.eye(r)
-    by_free = np.linalg.solve(information[:r, :r], information[:r, r:])
-    own = information[r:, r:] - information[r:, :r] @ by_free
-    scale = np.sqrt(with_all_known)
-    if not scale.all() or np.linalg.eigvalsh(own / np.outer(scale, scale))[0] < _ROUND_OFF:
-        return None
-    pull = np.einsum("nmq,nm,nm->q", by_compliance, weights, fit.residuals)
-    change = -np.asarray(np.linalg.solve(own, pull))
-    covariance = result.uncertainty.scatter * np.linalg.inv(own)
-    # Bias by errors of the tensions, from the squares that these changes leave.
-    squares, nominal = result.uncertainty.tension_squares, _nominal_compliance(result)
-    left = max(1.0 + float(pull @ change) / squares.sum(), 0.0) if squares.any() else 0.0
-    by_share = left * squares / np.maximum(nominal + groups @ change, LEAST_SHARE * nominal)
-    by_logarithm = by_share * result.rig.cable_stiffness / result.geometry.stiffness
-    free_scores = result.observability.known.T @ parameters.tension_scores(by_logarithm)
-    biased = np.linalg.solve(own, groups.T @ by_share + by_free.T @ free_scores) * ALL_OR_NONE
-    # Errors of tensions only make cables seem stiffer.
-    explained = np.where(change < 0.0, biased, 0.0)
-    return change, covariance + np.outer(explained, explained)
+    return information, gradient, with_all_known
 
 
 # The verdict.
@@ -219,58 +241,23 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
         wanted: Required error, 95 %, [m].
         tilt: Largest rotation of the platform from its orientation at home, [rad].
     """
-    (level, *level_parts), (rotated, *rotated_parts) = (
+    at_level, at_tilt = (
         [float(e.max()) for e in result.position_errors(*workspace_poses(result.rig, angle))]
         for angle in (0.0, tilt)
     )
-    out = result.held_out
+    level, rotated, out = at_level[0], at_tilt[0], result.held_out
     missed = float(np.quantile(out.after, CONFIDENCE))
     before, after = (float(np.sqrt(np.mean(e**2))) for e in (out.before, out.after))
-    issues = _deviation_issues(result) + _common_issues(result) + _stiffness_issues(result)
-    issues += _tension_issues(result) + _sensor_issues(result) + _pose_issues(result)
-    if missed > wanted:
-        what = "samples" if out.poses else "cable lengths of samples"
-        issues.append(
-            Issue(
-                f"errors of held-out {what} reach {beyond(missed, wanted)}",
-                "calibrate the camera and its pose, and check for worn guides, slack cables, errors"
-                " of measured tensions and outliers in the report's list of poses",
-            )
-        )
-    worse = math.sqrt(max(after**2 - before**2, 0.0))
-    # A fit to noise is worse than a rig file that is right, by no more than the fit states.
-    if worse > max(level, rotated):
-        issues.append(
-            Issue(
-                f"the rig file without calibration fits better ({before * 1e3:.2g} mm)",
-                "check units, the order of the cables and the homing of the drives",
-            )
-        )
-    if level > wanted:
-        issues.append(
-            Issue(
-                f"between the measured poses, the platform may be off by {beyond(level, wanted)}",
-                _shared_cause(level, *level_parts)
-                or "measure at more poses all over the workspace"
-                + ("" if out.poses else ", and with a camera"),
-            )
-        )
-    if rotated > max(wanted, level):
-        issues.append(
-            Issue(
-                f"rotated by {math.degrees(tilt):.3g}°, the platform may be off by"
-                f" {beyond(rotated, wanted)}",
-                _shared_cause(rotated, *rotated_parts)
-                or (
-                    f"measure with the platform rotated by ±{math.degrees(tilt):.3g}° or more"
-                    " (`cdpr calibrate poses` plans it)"
-                    if result.measured.has_rotation.any()
-                    else "measure the platform's rotation as well (camera, or several reflectors),"
-                    f" or at more poses rotated by ±{math.degrees(tilt):.3g}° or more"
-                )
-                + "; if it never rotates, pass --tilt-deg 0, in Python tilt=0",
-            )
-        )
+    issues = [
+        *_deviation_issues(result),
+        *_common_issues(result),
+        *_stiffness_issues(result),
+        *_tension_issues(result),
+        *_sensor_issues(result),
+        *_pose_issues(result),
+        *_held_out_issues(out.poses, missed, wanted, before, after, max(level, rotated)),
+        *_position_issues(result, at_level, at_tilt, wanted, tilt),
+    ]
     error = max(missed, level, rotated)
     verdict = CalibrationVerdict.of(
         error, wanted, f"rotated by up to {math.degrees(tilt):.3g}°", issues
@@ -284,26 +271,24 @@ def judge_rig(result: RigCalibration, wanted: float, tilt: float) -> RigQuality:
     return RigQuality(verdict, before, after, level, rotated, tilt)
 
 
-def _deviation_issues(result: RigCalibration) -> list[Issue]:
+def _deviation_issues(result: RigCalibration) -> Iterator[Issue]:
     """An issue if the parameter farthest from the rig file is not credible."""
     parameters, values = result.parameters, result.fit.values
     times = np.abs(values) / parameters.deviations
     k = int(np.argmax(times))
     if times[k] <= FAR:
-        return []
+        return
     group = next(g for g, s in parameters.slices().items() if s.start <= k < s.stop)
     option = option_of(group)
-    return [
-        Issue(
-            f"{parameters.names[k]} is {deviation_text(group, float(values[k]))},"
-            f" {times[k]:.3g} times {option}",
-            "check units, the order of the cables and the rig file; if it is truly that far"
-            f" off, pass a larger {option}",
-        )
-    ]
+    yield Issue(
+        f"{parameters.names[k]} is {deviation_text(group, float(values[k]))},"
+        f" {times[k]:.3g} times {option}",
+        "check units, the order of the cables and the rig file; if it is truly that far"
+        f" off, pass a larger {option}",
+    )
 
 
-def _common_issues(result: RigCalibration) -> list[Issue]:
+def _common_issues(result: RigCalibration) -> Iterator[Issue]:
     """Issues for changes that outlets and drums share, which residuals do not show."""
     found = result.uncertainty
     covariance = found.by_scatter + found.common @ found.common.T
@@ -315,7 +300,6 @@ def _common_issues(result: RigCalibration) -> list[Issue]:
         (slice(3, 6), f"all outlets are rotated together by {math.degrees(sizes[1]):.2g}°", _FRAME),
         (slice(0, 3), f"all outlets are displaced together by {sizes[0] * 1e3:.3g} mm", _FRAME),
     )
-    issues = []
     for part, what, check in cases:
         own = changes[part]
         times = math.sqrt(own @ np.linalg.solve(covariance[part, part], own))
@@ -325,79 +309,71 @@ def _common_issues(result: RigCalibration) -> list[Issue]:
                 f"check {check}; if the rig file is truly that far off, pass a larger --outlets-mm,"
                 " in Python outlets in deviations="
             )
-            issues.append(Issue(reason, step))
-    return issues
+            yield Issue(reason, step)
 
 
-def _stiffness_issues(result: RigCalibration) -> list[Issue]:
+def _stiffness_issues(result: RigCalibration) -> Iterator[Issue]:
     compliance = estimate_compliance(result)
     if compliance is None or "cable_stiffness" in result.parameters.groups:
-        return []
-    if not compliance.contradicts:
-        return _difference_issues(result)
-    return [
-        Issue(
+        return
+    if compliance.contradicts:
+        yield Issue(
             f"the data give a cable stiffness of {compliance}, the rig file"
             f" {result.rig.cable_stiffness.mean():.6g} N",
             "check cables: stiffness_n of the rig file, and the measured tensions;"
             " if it is truly that far off, pass a larger --stiffness-percent, in Python"
             " stiffness in deviations=",
         )
-    ]
+    else:
+        yield from _difference_issues(result)
 
 
-def _difference_issues(result: RigCalibration) -> list[Issue]:
+def _difference_issues(result: RigCalibration) -> Iterator[Issue]:
     differences = estimate_cable_compliances(result)
     if differences is None or not differences.contradict:
-        return []
-    return [
-        Issue(
-            f"the cables differ: the data give stiffnesses of {differences}; the result has"
-            f" {result.geometry.stiffness.mean():.4g} N for all",
-            "check for a cable that is worn, loose on its drum or of another kind, and check its"
-            " measured tensions; if they truly differ, pass --stiffness-per-cable, in Python"
-            " cable_stiffness in deviations=",
-        )
-    ]
+        return
+    yield Issue(
+        f"the cables differ: the data give stiffnesses of {differences}; the result has"
+        f" {result.geometry.stiffness.mean():.4g} N for all",
+        "check for a cable that is worn, loose on its drum or of another kind, and check its"
+        " measured tensions; if they truly differ, pass --stiffness-per-cable, in Python"
+        " cable_stiffness in deviations=",
+    )
 
 
-def _tension_issues(result: RigCalibration) -> list[Issue]:
+def _tension_issues(result: RigCalibration) -> Iterator[Issue]:
     """An issue if missing tensions matter: their errors are correlated between samples."""
     usual = result.length_deviation
     lengths = result.fit.deviations[:, : result.rig.cable_count]
     stretch = float(np.sqrt(np.max(lengths**2) - usual**2))
     if stretch <= usual:
-        return []
+        return
     missing = int((~np.isfinite(result.measured.tensions)).any(axis=1).sum())
-    return [
-        Issue(
-            f"tensions were not measured at {missing} poses, which makes cable lengths"
-            f" uncertain by {stretch * 1e3:.2g} mm; with measured tensions it is"
-            f" {usual * 1e3:.2g} mm",
-            "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
-        )
-    ]
+    yield Issue(
+        f"tensions were not measured at {missing} poses, which makes cable lengths"
+        f" uncertain by {stretch * 1e3:.2g} mm; with measured tensions it is"
+        f" {usual * 1e3:.2g} mm",
+        "measure tensions as well: use run folders, or tables with the columns tension_1_n …",
+    )
 
 
-def _sensor_issues(result: RigCalibration) -> list[Issue]:
+def _sensor_issues(result: RigCalibration) -> Iterator[Issue]:
     """An issue if sensors scatter more than stated, as with a wrong pulley axis."""
     fit, m = result.fit, result.rig.cable_count
     times = fit.sensor_rms / fit.deviations[:, m:].min(axis=0)
     bad = np.flatnonzero(times > SCATTERED)
     if not len(bad):
-        return []
+        return
     names = ", ".join(fit.sensors[k] for k in bad)
-    return [
-        Issue(
-            f"residuals of {names} are up to {times[bad].max():.2g} times their stated deviation",
-            "check feed_directions in the rig file and the axes of the IMU (--imu-mounting-deg"
-            " finds its mounting), or pass a larger --swivel-deg or --imu-deg; in Python"
-            " imu_mounting in deviations=, swivel_deviation= and imu_deviation=",
-        )
-    ]
+    yield Issue(
+        f"residuals of {names} are up to {times[bad].max():.2g} times their stated deviation",
+        "check feed_directions in the rig file and the axes of the IMU (--imu-mounting-deg"
+        " finds its mounting), or pass a larger --swivel-deg or --imu-deg; in Python"
+        " imu_mounting in deviations=, swivel_deviation= and imu_deviation=",
+    )
 
 
-def _pose_issues(result: RigCalibration) -> list[Issue]:
+def _pose_issues(result: RigCalibration) -> Iterator[Issue]:
     """An issue for measured positions or rotations that scatter more than stated."""
     by_camera = bool(result.rig.cameras)
     causes = ["the camera's lens, the layout of the tags"] if by_camera else []
@@ -407,8 +383,57 @@ def _pose_issues(result: RigCalibration) -> list[Issue]:
         f"check {', '.join(causes)} and the stated errors of the poses, or pass a larger --pose-mm"
         " or --pose-deg, in Python pose_deviations="
     )
-    return [
-        Issue(f"the measured {what} scatter {times:.3g} times as much as stated", step)
-        for what, times in zip(("positions", "rotations"), result.pose_scales, strict=True)
-        if times > SCATTERED
-    ]
+    for what, times in zip(("positions", "rotations"), result.pose_scales, strict=True):
+        if times > SCATTERED:
+            yield Issue(f"the measured {what} scatter {times:.3g} times as much as stated", step)
+
+
+def _held_out_issues(
+    has_poses: bool, missed: float, wanted: float, before: float, after: float, stated: float
+) -> Iterator[Issue]:
+    """Issues for held-out samples: their error, and the RMS with the rig file and after; [m]."""
+    if missed > wanted:
+        what = "samples" if has_poses else "cable lengths of samples"
+        yield Issue(
+            f"errors of held-out {what} reach {beyond(missed, wanted)}",
+            "calibrate the camera and its pose, and check for worn guides, slack cables, errors"
+            " of measured tensions and outliers in the report's list of poses",
+        )
+    # A fit to noise is worse than a rig file that is right, by no more than the fit states.
+    if math.sqrt(max(after**2 - before**2, 0.0)) > stated:
+        yield Issue(
+            f"the rig file without calibration fits better ({before * 1e3:.2g} mm)",
+            "check units, the order of the cables and the homing of the drives",
+        )
+
+
+def _position_issues(
+    result: RigCalibration,
+    at_level: Sequence[float],
+    at_tilt: Sequence[float],
+    wanted: float,
+    tilt: float,
+) -> Iterator[Issue]:
+    """Issues for the platform's position; errors and their parts as for `_shared_cause`."""
+    level, rotated = at_level[0], at_tilt[0]
+    if level > wanted:
+        yield Issue(
+            f"between the measured poses, the platform may be off by {beyond(level, wanted)}",
+            _shared_cause(*at_level)
+            or "measure at more poses all over the workspace"
+            + ("" if result.held_out.poses else ", and with a camera"),
+        )
+    if rotated > max(wanted, level):
+        angle = f"{math.degrees(tilt):.3g}°"
+        yield Issue(
+            f"rotated by {angle}, the platform may be off by {beyond(rotated, wanted)}",
+            _shared_cause(*at_tilt)
+            or (
+                f"measure with the platform rotated by ±{angle} or more (`cdpr calibrate poses`"
+                " plans it)"
+                if result.measured.has_rotation.any()
+                else "measure the platform's rotation as well (camera, or several reflectors),"
+                f" or at more poses rotated by ±{angle} or more"
+            )
+            + "; if it never rotates, pass --tilt-deg 0, in Python tilt=0",
+        )

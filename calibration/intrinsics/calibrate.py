@@ -34,7 +34,7 @@ from calibration.targets.boards import Board, DetectedBoard, is_mirrored
 from model.cameras import Z_95, generic_camera
 from model.errors import BadInput
 from model.pose import Array, Pose, matrix_from_rotation_vector, read_only
-from tracking.camera_model import Image
+from tracking.camera_model import Image, rms
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -396,10 +396,7 @@ def _fit(views: Mapping[str, DetectedBoard], size: tuple[int, int], lens: str) -
 
 def _errors(fit: LensFit, views: Mapping[str, DetectedBoard]) -> dict[str, float]:
     """RMS corner error of each image, [px]."""
-    return {
-        name: float(np.sqrt(np.mean(np.sum(fit.residuals(name, seen) ** 2, axis=1))))
-        for name, seen in views.items()
-    }
+    return {name: float(rms(fit.residuals(name, seen))) for name, seen in views.items()}
 
 
 def _undetermined(why: str) -> BadInput:

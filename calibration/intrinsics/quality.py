@@ -15,7 +15,7 @@ from calibration.targets.boards import Charuco
 from calibration.targets.grids import TagGrid
 from model.errors import BadInput
 from model.pose import Array, rotation_vector_from_matrix
-from tracking.camera_model import rays_of
+from tracking.camera_model import rays_of, rms
 
 CELLS = (8, 6)
 """Columns and rows of the coverage map."""
@@ -113,8 +113,7 @@ def judge_camera(
     slopes = _without_rotation(*_grid_slopes(result))
     scale = distance / float(np.sqrt(result.matrix[0, 0] * result.matrix[1, 1]))
     error = scale * np.sqrt(2.0) * result.uncertainty.error_of(slopes)  # of both axes
-    apart = slopes @ result.uncertainty.halves
-    halves = scale * float(np.sqrt(np.mean(np.sum(apart**2, axis=1))))
+    halves = scale * float(rms(slopes @ result.uncertainty.halves))
     if not np.isfinite([error, halves]).all():
         raise _unreached(result)
     bow, bent = bow_of(result)

@@ -31,7 +31,7 @@ from model.files.camera_file import CameraDocument, LensCovariance, LensName
 from model.files.documents import AnyNonNegative, AnyNumber, Positive
 from model.files.rig_file import RigDocument
 from model.pose import Array, rotation_vector_from_matrix
-from tracking.camera_model import project, rays_of
+from tracking.camera_model import project, rays_of, rms
 
 _WIDTH = 560.0
 _MOST_ARROWS = 1500
@@ -277,7 +277,7 @@ class CameraResult(ResultDocument):
             project(self.lens, self.matrix, np.array(self.distortion), points)
             for points in (rays[0], rays[1] @ turn.T)
         )
-        pixels = np.sqrt(np.mean(np.sum((others - own) ** 2, axis=1)))
+        pixels = rms(others - own)
         return float(pixels / np.sqrt(self.fx_px * self.fy_px)) * self.distance_m * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:

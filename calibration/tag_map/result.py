@@ -34,6 +34,7 @@ from model.files.documents import AnyNonNegative, PoseDocument, Positive
 from model.files.rig_file import RigDocument
 from model.pose import Array, Pose, step_between
 from model.rig import Tag
+from tracking.camera_model import rms
 from tracking.detection.tags import mounted_rotated, tag_corners
 
 
@@ -79,7 +80,7 @@ class TagsResult(ResultDocument):
                 where=f"calibration {self.kind} {self.name}, {self.date}",
                 next_step="compare results for the same platform",
             )
-        return float(np.sqrt(np.mean(np.sum(np.concatenate(gaps) ** 2, axis=1)))) * 1e3
+        return float(rms(np.concatenate(gaps))) * 1e3
 
     def corrected(self, rig: RigDocument) -> RigDocument:
         """The rig file's content with the tags at these poses.

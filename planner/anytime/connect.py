@@ -9,6 +9,8 @@ Functions called for every sample are inlined: passing a problem takes as long a
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,53 +27,63 @@ NODES = 2048
 _FROM_INSIDE = 0.25
 """Part of the samples that are uniform in the workspace box."""
 
+EDGES_TESTED, SAMPLES_DRAWN = 2, 3
+"""Indices of `Trees.counts`, behind the numbers of nodes."""
+
+
+class Trees(NamedTuple):
+    """The trees of start and goal; kernels change them in place.
+
+    Attributes:
+        nodes: Shape (2, NODES, 3), [m].
+        parents: Of each node, -1 for the root, shape (2, NODES).
+        counts: Numbers of nodes in both trees, and of edge tests and samples so far, shape (4,);
+            zeros at first.
+    """
+
+    nodes: Array
+    parents: Integers
+    counts: Integers
+
 
 @leaf
 def connect(
-    problem: PathProblem,
-    ends: Array,
-    state: RandomState,
-    trees: Array,
-    parents: Integers,
-    counts: Integers,
-    samples: int,
-    path: Array,
+    problem: PathProblem, ends: Array, state: RandomState, trees: Trees, samples: int, path: Array
 ) -> int:
     """Grows both trees until they meet; called again with the same trees it continues.
 
     Args:
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
-        trees: Nodes, shape (2, NODES, 3), written.
-        parents: Shape (2, NODES), written.
-        counts: Nodes in both trees, edge tests and samples so far, shape (4,); zeros at first.
+        trees: Extended.
         samples: Most samples to draw.
         path: From start to goal, shape (MOST_ON_PATH, 3), written.
 
     Returns:
         The number of vertices of the path; 0 where none was found yet.
     """
+    nodes, counts = trees.nodes, trees.counts
     if counts[0] == 0:
-        _put(trees[0], 0, row_of(ends[0]))
-        _put(trees[1], 0, row_of(ends[1]))
-        parents[0, 0], parents[1, 0] = -1, -1
-        counts[0], counts[1], counts[2] = 1, 1, counts[2] + 1
+        _put(nodes[0], 0, row_of(ends[0]))
+        _put(nodes[1], 0, row_of(ends[1]))
+        trees.parents[0, 0], trees.parents[1, 0] = -1, -1
+        counts[0], counts[1], counts[EDGES_TESTED] = 1, 1, counts[EDGES_TESTED] + 1
         if edge_allowed(problem, row_of(ends[0]), row_of(ends[1])):
             _put(path, 0, row_of(ends[0]))
             _put(path, 1, row_of(ends[1]))
             return 2
     for _ in range(samples):
-        counts[3] += 1
+        counts[SAMPLES_DRAWN] += 1
         wanted = _sample(problem, state)
-        tree = counts[3] & 1
-        near = _extended(problem, trees, parents, counts, tree, wanted)
+        tree = counts[SAMPLES_DRAWN] & 1
+        near = _extended(problem, trees, tree, wanted)
         if near < 0:
             continue
-        far = _nearest(trees, 1 - tree, counts[1 - tree], wanted)
-        counts[2] += 1
-        if edge_allowed(problem, row_of(trees[1 - tree, far]), wanted):
+        far = _nearest(trees, 1 - tree, wanted)
+        counts[EDGES_TESTED] += 1
+        if edge_allowed(problem, row_of(nodes[1 - tree, far]), wanted):
             first, second = (near, far) if tree == 0 else (far, near)
-            return _joined(trees, parents, first, wanted, second, path)
+            return _joined(trees, first, wanted, second, path)
     return 0
 
 
@@ -98,36 +110,30 @@ def _drawn(state: RandomState, wide: float, low: float, high: float) -> float:
 
 
 @inlined
-def _extended(
-    problem: PathProblem,
-    trees: Array,
-    parents: Integers,
-    counts: Integers,
-    tree: int,
-    wanted: Vector,
-) -> int:
+def _extended(problem: PathProblem, trees: Trees, tree: int, wanted: Vector) -> int:
     """Grows one tree to a point: the node whose edge to the point is allowed, or -1."""
-    nearest = _nearest(trees, tree, counts[tree], wanted)
-    at = row_of(trees[tree, nearest])
-    counts[2] += 1
+    nearest, counts = _nearest(trees, tree, wanted), trees.counts
+    at = row_of(trees.nodes[tree, nearest])
+    counts[EDGES_TESTED] += 1
     if not edge_allowed(problem, at, wanted):
         return -1
     if counts[tree] < NODES:
         new = counts[tree]
-        _put(trees[tree], new, wanted)
-        parents[tree, new] = nearest
+        _put(trees.nodes[tree], new, wanted)
+        trees.parents[tree, new] = nearest
         counts[tree] = new + 1
     return nearest
 
 
 @inlined
-def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
+def _nearest(trees: Trees, tree: int, wanted: Vector) -> int:
+    nodes = trees.nodes
     best, least = 0, np.inf
-    for i in range(count):
+    for i in range(trees.counts[tree]):
         x, y, z = (
-            trees[tree, i, 0] - wanted[0],
-            trees[tree, i, 1] - wanted[1],
-            trees[tree, i, 2] - wanted[2],
+            nodes[tree, i, 0] - wanted[0],
+            nodes[tree, i, 1] - wanted[1],
+            nodes[tree, i, 2] - wanted[2],
         )
         squared = x * x + y * y + z * z
         if squared < least:
@@ -136,10 +142,9 @@ def _nearest(trees: Array, tree: int, count: int, wanted: Vector) -> int:
 
 
 @leaf
-def _joined(
-    trees: Array, parents: Integers, first: int, between: Vector, second: int, path: Array
-) -> int:
+def _joined(trees: Trees, first: int, between: Vector, second: int, path: Array) -> int:
     """Writes the path from the first root through a point to the second; 0 if it does not fit."""
+    nodes, parents = trees.nodes, trees.parents
     length, node = 0, first
     while node >= 0:
         length, node = length + 1, parents[0, node]
@@ -150,12 +155,12 @@ def _joined(
         return 0
     node = first
     for i in range(length - 1, -1, -1):
-        _put(path, i, row_of(trees[0, node]))
+        _put(path, i, row_of(nodes[0, node]))
         node = parents[0, node]
     _put(path, length, between)
     node = second
     for i in range(length + 1, length + 1 + other):
-        _put(path, i, row_of(trees[1, node]))
+        _put(path, i, row_of(nodes[1, node]))
         node = parents[1, node]
     return length + 1 + other
 

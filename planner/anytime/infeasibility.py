@@ -19,7 +19,7 @@ from model.errors import NoSolution
 from model.rig import Rig
 from model.scene import Scene
 from planner.anytime.problem import PathProblem
-from planner.anytime.state import BEST, AnytimeSearch
+from planner.anytime.state import BEST, ROUNDS, AnytimeSearch
 from planner.collision.edges import edge_clearance, row_of
 from planner.collision.swept_pair import cable_apart, platform_apart
 from planner.edge_checks import REASONS, edge_problem
@@ -158,7 +158,7 @@ def no_path(
         settings: Objective, seed and budget.
     """
     values: dict[str, float | str] = {
-        "rounds": float(search.totals[0]),
+        "rounds": float(search.totals[ROUNDS]),
         "seed": float(settings.seed),
     }
     where = f"scene {scene.name}"
@@ -180,7 +180,7 @@ def no_path(
             values={**values, "proved": "yes"},
         )
     return NoSolution(
-        settings.not_found(int(search.totals[0]), gap),
+        settings.not_found(int(search.totals[ROUNDS]), gap),
         where=where,
         why=f"it is not proved that no path exists; {_blocking_pairs(rig, scene, problem, search)}",
         next_step=f"{settings.longer}, reduce the clearance, try another seed, or move the"
@@ -197,7 +197,7 @@ def _rotate(scene: Scene) -> str:
 
 def _gap(search: AnytimeSearch) -> float:
     """Smallest distance between nodes of the two trees, [m]."""
-    first, second = (search.trees[k, : search.grown[k]] for k in (0, 1))
+    first, second = (search.trees.nodes[k, : search.trees.counts[k]] for k in (0, 1))
     if not len(first) or not len(second):
         return float(np.linalg.norm(search.ends[1] - search.ends[0]))
     return smallest_gap(first, second)

@@ -14,10 +14,12 @@ Nearly all functions are inlined: passing a problem takes as long as several edg
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from planner.anytime.connect import Trees
 from planner.anytime.problem import PathProblem, edge_allowed
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, leaf
@@ -55,19 +57,33 @@ _START, _GOAL = 0, 1
 _ANY_OTHER = -1
 """In place of a component: any but the node's own."""
 
+NODES_MADE, TESTS_MADE = 0, 1
+"""Indices of `Roadmap.made`."""
+
+
+class Roadmap(NamedTuple):
+    """Nodes that straight edges join to components; kernels change it in place.
+
+    Attributes:
+        nodes: The first two are start and goal, shape (ROADMAP_NODES, 3), [m].
+        above: Parent of each node, -1 for the root of a component, shape (ROADMAP_NODES,).
+        parts: Component of each node, shape (ROADMAP_NODES,).
+        made: Numbers of nodes and of edge tests so far, shape (2,); zeros at first.
+    """
+
+    nodes: Array
+    above: Integers
+    parts: Integers
+    made: Integers
+
 
 @leaf
 def through_passages(
     problem: PathProblem,
     ends: Array,
     state: RandomState,
-    nodes: Array,
-    above: Integers,
-    parts: Integers,
-    made: Integers,
-    trees: Array,
-    parents: Integers,
-    counts: Integers,
+    roadmap: Roadmap,
+    trees: Trees,
     samples: int,
     path: Array,
 ) -> int:
@@ -76,92 +92,78 @@ def through_passages(
     Args:
         ends: Start and goal, shape (2, 3), [m].
         state: Of the random numbers; stepped.
-        nodes: Nodes, the first two start and goal, shape (ROADMAP_NODES, 3), written.
-        above: Parent of each node, -1 for the root of a component, shape (ROADMAP_NODES,).
-        parts: Component of each node, shape (ROADMAP_NODES,), written.
-        made: Nodes and edge tests so far, shape (2,); zeros at first.
-        trees: Of start and goal, see `planner.anytime.connect.connect`, shape (2, k, 3), [m].
-        parents: See there, shape (2, k).
-        counts: Nodes in both trees.
+        roadmap: Extended.
+        trees: Of start and goal.
         samples: Most samples to draw.
         path: From start to goal, shape (k, 3), written.
 
     Returns:
         The number of vertices of the path; 0 where none was found yet.
     """
+    made, parts = roadmap.made, roadmap.parts
     for _ in range(samples):
-        if made[0] == 0 or made[0] + 3 > len(nodes):
-            _begin(ends, nodes, above, parts, made)
-            _add_trees(nodes, above, parts, made, trees, parents, counts)
-        node, touched, other = made[0], -1, -1
+        if made[NODES_MADE] == 0 or made[NODES_MADE] + 3 > len(roadmap.nodes):
+            _begin(ends, roadmap)
+            _add_trees(roadmap, trees)
+        node, touched, other = made[NODES_MADE], -1, -1
         choice = uniform(state)
         if _IN_GAPS <= choice < _IN_GAPS + _NEAR_NODES:
-            near = below(state, made[0])
+            near = below(state, made[NODES_MADE])
             size = _NEAREST * math.exp(uniform(state) * math.log(_FARTHEST / _NEAREST))
-            _add_segment(problem, nodes, above, parts, made, near, direction(state), size)
+            _add_segment(problem, roadmap, near, direction(state), size)
         else:
             at = _anywhere(problem.world, state)
             if choice < _IN_GAPS:
                 at, touched, other = _out_of_obstacles(problem.world, state, at)
-            if not _allowed(problem, made, at, at):
+            if not _allowed(problem, roadmap, at, at):
                 continue
-            _add(nodes, above, parts, made, at, -1)
-        while node < made[0] and parts[_START] != parts[_GOAL]:
-            _join(problem, nodes, above, parts, made, node)
+            _add(roadmap, at, -1)
+        while node < made[NODES_MADE] and parts[_START] != parts[_GOAL]:
+            _join(problem, roadmap, node)
             if touched >= 0 and parts[_START] != parts[_GOAL]:
-                _add_segments(problem, state, nodes, above, parts, made, node, touched, other)
+                _add_segments(problem, state, roadmap, node, touched, other)
                 touched = -1
             node += 1
         if parts[_START] == parts[_GOAL]:
-            count = _path(nodes, above, path)
-            made[0] = 0
+            count = _path(roadmap, path)
+            made[NODES_MADE] = 0
             if count > 0:
                 return count
     return 0
 
 
 @leaf
-def _begin(ends: Array, nodes: Array, above: Integers, parts: Integers, made: Integers) -> None:
-    made[0] = 0
-    _add(nodes, above, parts, made, row_of(ends[0]), -1)
-    _add(nodes, above, parts, made, row_of(ends[1]), -1)
+def _begin(ends: Array, roadmap: Roadmap) -> None:
+    roadmap.made[NODES_MADE] = 0
+    _add(roadmap, row_of(ends[0]), -1)
+    _add(roadmap, row_of(ends[1]), -1)
 
 
 @leaf
-def _add_trees(
-    nodes: Array,
-    above: Integers,
-    parts: Integers,
-    made: Integers,
-    trees: Array,
-    parents: Integers,
-    counts: Integers,
-) -> None:
+def _add_trees(roadmap: Roadmap, trees: Trees) -> None:
     """Adds the nodes of both trees to the components of start and goal."""
     for tree in range(2):
-        first = made[0]
-        for i in range(1, min(counts[tree], _FROM_TREES)):
-            parent = parents[tree, i]  # precedes its child, so it is already added
+        first = roadmap.made[NODES_MADE]
+        for i in range(1, min(trees.counts[tree], _FROM_TREES)):
+            parent = trees.parents[tree, i]  # precedes its child, so it is already added
             below_it = tree if parent == 0 else first + parent - 1
-            _add(nodes, above, parts, made, row_of(trees[tree, i]), below_it)
+            _add(roadmap, row_of(trees.nodes[tree, i]), below_it)
 
 
 @inlined
-def _allowed(problem: PathProblem, made: Integers, start: Vector, end: Vector) -> bool:
-    made[1] += 1
+def _allowed(problem: PathProblem, roadmap: Roadmap, start: Vector, end: Vector) -> bool:
+    roadmap.made[TESTS_MADE] += 1
     return edge_allowed(problem, start, end)
 
 
 @leaf
-def _add(
-    nodes: Array, above: Integers, parts: Integers, made: Integers, at: Vector, parent: int
-) -> None:
+def _add(roadmap: Roadmap, at: Vector, parent: int) -> None:
     """Adds a node below another, or as a component of its own."""
-    new = made[0]
+    nodes, parts, new = roadmap.nodes, roadmap.parts, roadmap.made[NODES_MADE]
     nodes[new, 0], nodes[new, 1], nodes[new, 2] = at
-    above[new] = parent
+    roadmap.above[new] = parent
     parts[new] = parts[parent] if parent >= 0 else new
-    made[0] = new + 1
+    roadmap.made[NODES_MADE] = new + 1
 
 
 @inlined
@@ -233,10 +235,7 @@ def _room(world: World, k: int, at: Vector) -> float:
 def _add_segments(
     problem: PathProblem,
     state: RandomState,
-    nodes: Array,
-    above: Integers,
-    parts: Integers,
-    made: Integers,
+    roadmap: Roadmap,
     node: int,
     touched: int,
     other: int,
@@ -257,26 +256,19 @@ def _add_segments(
     reach = norm(minus(row_of(problem.world.limits[1]), row_of(problem.world.limits[0])))
     for sign in (-1.0, 1.0):
         one = (sign * tangent[0] / size, sign * tangent[1] / size, sign * tangent[2] / size)
-        _add_segment(problem, nodes, above, parts, made, node, one, reach)
+        _add_segment(problem, roadmap, node, one, reach)
 
 
 @inlined
 def _add_segment(
-    problem: PathProblem,
-    nodes: Array,
-    above: Integers,
-    parts: Integers,
-    made: Integers,
-    node: int,
-    heading: Vector,
-    reach: float,
+    problem: PathProblem, roadmap: Roadmap, node: int, heading: Vector, reach: float
 ) -> None:
     """Adds the farthest point allowed from a node along a unit vector, at most ``reach`` away."""
-    start = row_of(nodes[node])
+    start = row_of(roadmap.nodes[node])
     reach = min(reach, _to_the_wall(problem.world, start, heading))
     low, high, share = 0.0, 1.0, 1.0
     for _ in range(_BISECTIONS):
-        if _allowed(problem, made, start, along(start, heading, share * reach)):
+        if _allowed(problem, roadmap, start, along(start, heading, share * reach)):
             low = share
         else:
             high = share
@@ -284,7 +276,7 @@ def _add_segment(
             break
         share = (low + high) / 2.0
     if low * reach > _NEAREST:
-        _add(nodes, above, parts, made, along(start, heading, low * reach), node)
+        _add(roadmap, along(start, heading, low * reach), node)
 
 
 @inlined
@@ -300,37 +292,29 @@ def _to_the_wall(world: World, start: Vector, heading: Vector) -> float:
 
 
 @inlined
-def _join(
-    problem: PathProblem, nodes: Array, above: Integers, parts: Integers, made: Integers, node: int
-) -> None:
+def _join(problem: PathProblem, roadmap: Roadmap, node: int) -> None:
     """Joins a node to the components of start and goal, and to the nearest node of any other."""
+    parts = roadmap.parts
     for k in range(3):
         part = parts[_START] if k == 0 else (parts[_GOAL] if k == 1 else _ANY_OTHER)
         if part != parts[node]:
-            _try_to_join(problem, nodes, above, parts, made, node, part)
+            _try_to_join(problem, roadmap, node, part)
 
 
 @inlined
-def _try_to_join(
-    problem: PathProblem,
-    nodes: Array,
-    above: Integers,
-    parts: Integers,
-    made: Integers,
-    node: int,
-    part: int,
-) -> None:
+def _try_to_join(problem: PathProblem, roadmap: Roadmap, node: int, part: int) -> None:
     """Tries an edge to the nearest node of a component, or of any but the node's own."""
+    nodes, parts = roadmap.nodes, roadmap.parts
     own, best, least = parts[node], -1, math.inf
     x, y, z = nodes[node, 0], nodes[node, 1], nodes[node, 2]
-    for i in range(made[0]):
+    for i in range(roadmap.made[NODES_MADE]):
         if parts[i] == own or part not in (_ANY_OTHER, parts[i]):
             continue
         squared = (nodes[i, 0] - x) ** 2 + (nodes[i, 1] - y) ** 2 + (nodes[i, 2] - z) ** 2
         if squared < least:
             best, least = i, squared
-    if best >= 0 and _allowed(problem, made, row_of(nodes[best]), row_of(nodes[node])):
-        _merge(above, parts, made, best, node)
+    if best >= 0 and _allowed(problem, roadmap, row_of(nodes[best]), row_of(nodes[node])):
+        _merge(roadmap.above, parts, roadmap.made, best, node)
 
 
 @leaf
@@ -339,7 +323,7 @@ def _merge(above: Integers, parts: Integers, made: Integers, one: int, two: int)
     _make_root(above, two)
     above[two] = one
     old, kept = parts[two], parts[one]
-    for i in range(made[0]):
+    for i in range(made[NODES_MADE]):
         if parts[i] == old:
             parts[i] = kept
 
@@ -355,13 +339,13 @@ def _make_root(above: Integers, node: int) -> None:
 
 
 @leaf
-def _path(nodes: Array, above: Integers, path: Array) -> int:
+def _path(roadmap: Roadmap, path: Array) -> int:
     """Writes the path from start to goal, both in one component; 0 if it does not fit."""
-    _make_root(above, _GOAL)
+    _make_root(roadmap.above, _GOAL)
     count, node = 0, _START
     while node >= 0:
         if count == len(path):
             return 0
-        path[count, 0], path[count, 1], path[count, 2] = row_of(nodes[node])
-        count, node = count + 1, above[node]
+        path[count, 0], path[count, 1], path[count, 2] = row_of(roadmap.nodes[node])
+        count, node = count + 1, roadmap.above[node]
     return count

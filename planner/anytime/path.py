@@ -17,11 +17,11 @@ import numpy as np
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
-from planner.anytime.connect import connect
+from planner.anytime.connect import EDGES_TESTED, SAMPLES_DRAWN, connect
 from planner.anytime.infeasibility import no_path
 from planner.anytime.lattice_path import lattice_path
 from planner.anytime.local_search import Polyline, cost_of, measure, polish, polyline_of
-from planner.anytime.passages import through_passages
+from planner.anytime.passages import TESTS_MADE, through_passages
 from planner.anytime.problem import (
     ASK_PROOF,
     CLEARANCE,
@@ -34,7 +34,19 @@ from planner.anytime.problem import (
     problem_of,
     set_weights,
 )
-from planner.anytime.state import BEST, KEPT, AnytimeSearch, Handle, new_search
+from planner.anytime.state import (
+    BEST,
+    FIRST_VERTICES,
+    KEPT,
+    NODES_BEFORE,
+    RESTARTED,
+    ROUNDS,
+    SOUGHT,
+    TESTS_BEFORE,
+    AnytimeSearch,
+    Handle,
+    new_search,
+)
 from planner.costs import KinematicCost, LimitedSearch
 from planner.kernels.jit import kernel, leaf
 from planner.kernels.primitives import uniform
@@ -81,8 +93,8 @@ def advance(handle: Handle, rounds: int) -> float:
     """
     problem, search = handle.problem, handle.search
     for _ in range(rounds):
-        begun = search.totals[0]
-        search.totals[0] += 1
+        begun = search.totals[ROUNDS]
+        search.totals[ROUNDS] += 1
         if begun == _PATIENCE and search.costs[BEST] == math.inf and _may_mislead(problem):
             _restart(problem, search, NO_MARGIN)
         kept = _chosen(search, begun)
@@ -149,11 +161,17 @@ def _may_mislead(problem: PathProblem) -> bool:
 def _restart(problem: PathProblem, search: AnytimeSearch, least: float) -> None:
     """Discards all but the best path and changes the least margin."""
     problem.terms[LEAST_MARGIN] = least
-    search.totals[2] += search.grown[2]
-    search.totals[3], search.totals[5] = 0, search.totals[0]
+    search.totals[SOUGHT], search.totals[RESTARTED] = 0, search.totals[ROUNDS]
     search.counts[:KEPT, 0], search.costs[:KEPT] = 0, math.inf
-    search.totals[2] += search.made[1]
-    search.grown[:], search.made[:], search.polished[:] = 0, 0, 0
+    search.polished[:] = 0
+    _discard_trees(search)
+
+
+@kernel
+def _discard_trees(search: AnytimeSearch) -> None:
+    grown, made = search.trees.counts, search.roadmap.made
+    search.totals[TESTS_BEFORE] += grown[EDGES_TESTED] + made[TESTS_MADE]
+    grown[:], made[:] = 0, 0
 
 
 @kernel
@@ -174,7 +192,7 @@ def _chosen(search: AnytimeSearch, begun: int) -> int:
     for k in range(1, KEPT):
         if search.costs[k] > search.costs[worst]:
             worst = k
-    if search.totals[3] < KEPT or search.costs[best] == math.inf:
+    if search.totals[SOUGHT] < KEPT or search.costs[best] == math.inf:
         return worst
     if begun % _ANOTHER_EVERY == 0:
         search.counts[worst, 0] = 0
@@ -188,11 +206,11 @@ def _chosen(search: AnytimeSearch, begun: int) -> int:
 @kernel
 def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
     """Finds a new path for a slot; returns the slot, else the best path's, or -1 without one."""
-    line, grown = _line(search, kept), search.grown
+    line = _line(search, kept)
     search.costs[kept], line.counts[0] = math.inf, 0
-    begun = search.totals[3]
-    search.totals[3] += 1
-    is_first = search.totals[4] == 0
+    begun = search.totals[SOUGHT]
+    search.totals[SOUGHT] += 1
+    is_first = search.totals[FIRST_VERTICES] == 0
     fine = _FINE if problem.terms[KINEMATIC] > 0.0 else _FINE_FOR_LENGTH
     on_lattice = begun == fine or begun % 2 == 1
     if is_first:
@@ -210,13 +228,11 @@ def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
         best = _cheapest(search)
         return best if search.costs[best] < math.inf else -1
     if not on_lattice:
-        search.totals[1] += grown[0] + grown[1]
-        search.totals[2] += grown[2]
-        search.totals[2] += search.made[1]
-        grown[:], search.made[:] = 0, 0
+        search.totals[NODES_BEFORE] += search.trees.counts[0] + search.trees.counts[1]
+        _discard_trees(search)
     line.counts[0], search.polished[kept] = found, 0
-    if search.totals[4] == 0:
-        search.totals[4], search.first[:] = found, line.points
+    if is_first:
+        search.totals[FIRST_VERTICES], search.first[:] = found, line.points
     search.costs[kept] = measure(problem, line)
     return kept
 
@@ -224,35 +240,16 @@ def _begin(problem: PathProblem, search: AnytimeSearch, kept: int) -> int:
 @leaf
 def sampled_path(problem: PathProblem, search: AnytimeSearch, points: Array) -> int:
     """Finds a path by two trees, or a roadmap where they miss a gap; number of vertices or 0."""
-    if search.grown[3] >= _SAMPLES_OF_TREES:
-        search.totals[2] += search.grown[2]
-        for i in range(len(search.grown)):
-            search.grown[i] = 0
+    ends, state, trees = search.ends, search.state, search.trees
+    if trees.counts[SAMPLES_DRAWN] >= _SAMPLES_OF_TREES:
+        search.totals[TESTS_BEFORE] += trees.counts[EDGES_TESTED]
+        for i in range(len(trees.counts)):
+            trees.counts[i] = 0
     for in_trees, in_passages in _TURNS:
-        found = connect(
-            problem,
-            search.ends,
-            search.state,
-            search.trees,
-            search.parents,
-            search.grown,
-            in_trees,
-            points,
-        )
+        found = connect(problem, ends, state, trees, in_trees, points)
         if found == 0:
             found = through_passages(
-                problem,
-                search.ends,
-                search.state,
-                search.nodes,
-                search.above,
-                search.parts,
-                search.made,
-                search.trees,
-                search.parents,
-                search.grown,
-                in_passages,
-                points,
+                problem, ends, state, search.roadmap, trees, in_passages, points
             )
         if found > 0:
             return found
@@ -363,13 +360,14 @@ class CompiledSearch:
     @property
     def first(self) -> Array:
         """The very first path, shape (k, 3), [m]; empty without one."""
-        return self.state.first[: self.state.totals[4]].copy()
+        return self.state.first[: self.state.totals[FIRST_VERTICES]].copy()
 
     @property
     def checks(self) -> int:
         """Number of edges checked."""
         state = self.state
-        return int(state.totals[2] + state.grown[2] + state.counts[:, 1].sum())
+        of_trees = state.totals[TESTS_BEFORE] + state.trees.counts[EDGES_TESTED]
+        return int(of_trees + state.counts[:, 1].sum())
 
     def advance(self) -> None:
         """Does one round."""
@@ -423,7 +421,7 @@ def _improve(
 
 
 def _is_over(search: CompiledSearch, settings: OptimalSettings, rounds: int, spent: float) -> bool:
-    begun = int(search.state.totals[5])
+    begun = int(search.state.totals[RESTARTED])
     least = least_rounds(has_limit=settings.longest < math.inf)
     if search.problem.terms[LEAST_MARGIN] == ASK_PROOF:
         least = LEAST_WITH_PROOFS

@@ -9,9 +9,9 @@ from numba import config, types
 from numba.experimental import structref
 from numpy.typing import NDArray
 
-from planner.anytime.connect import NODES
+from planner.anytime.connect import NODES, Trees
 from planner.anytime.local_search import MOST_VERTICES
-from planner.anytime.passages import ROADMAP_NODES
+from planner.anytime.passages import ROADMAP_NODES, Roadmap
 from planner.kernels.primitives import RandomState, seeded
 
 Array = NDArray[np.float64]
@@ -21,6 +21,8 @@ KEPT = 6
 """Paths that are stored and polished."""
 BEST = KEPT
 """Index of the best path so far, which is not polished."""
+ROUNDS, NODES_BEFORE, TESTS_BEFORE, SOUGHT, FIRST_VERTICES, RESTARTED = range(6)
+"""Indices of `AnytimeSearch.totals`."""
 
 
 class AnytimeSearch(NamedTuple):
@@ -33,13 +35,8 @@ class AnytimeSearch(NamedTuple):
         counts: Vertices (0: no path) and edge tests of each path, shape (KEPT + 1, 2).
         costs: Of each path; infinite for none, shape (KEPT + 1,).
         polished: Rounds spent on each path, shape (KEPT,).
-        trees: See `planner.anytime.connect.connect`, shape (2, NODES, 3), [m].
-        parents: See there, shape (2, NODES).
-        grown: See there (`counts`), shape (4,).
-        nodes: See `planner.anytime.passages.through_passages`, shape (ROADMAP_NODES, 3), [m].
-        above: See there, shape (ROADMAP_NODES,).
-        parts: See there, shape (ROADMAP_NODES,).
-        made: See there, shape (2,).
+        trees: Of start and goal.
+        roadmap: Of samples in gaps.
         totals: Rounds; nodes of finished trees and edge tests in them; first paths sought;
             vertices of the very first path; the round of the last restart, shape (6,).
         first: That path, shape (MOST_VERTICES, 3), [m].
@@ -52,13 +49,8 @@ class AnytimeSearch(NamedTuple):
     counts: Integers
     costs: Array
     polished: Integers
-    trees: Array
-    parents: Integers
-    grown: Integers
-    nodes: Array
-    above: Integers
-    parts: Integers
-    made: Integers
+    trees: Trees
+    roadmap: Roadmap
     totals: Integers
     first: Array
     state: RandomState
@@ -103,13 +95,17 @@ def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
         counts=np.zeros((KEPT + 1, 2), dtype=np.int64),
         costs=np.full(KEPT + 1, np.inf),
         polished=np.zeros(KEPT, dtype=np.int64),
-        trees=np.zeros((2, NODES, 3)),
-        parents=np.zeros((2, NODES), dtype=np.int64),
-        grown=np.zeros(4, dtype=np.int64),
-        nodes=np.zeros((ROADMAP_NODES, 3)),
-        above=np.zeros(ROADMAP_NODES, dtype=np.int64),
-        parts=np.zeros(ROADMAP_NODES, dtype=np.int64),
-        made=np.zeros(2, dtype=np.int64),
+        trees=Trees(
+            nodes=np.zeros((2, NODES, 3)),
+            parents=np.zeros((2, NODES), dtype=np.int64),
+            counts=np.zeros(4, dtype=np.int64),
+        ),
+        roadmap=Roadmap(
+            nodes=np.zeros((ROADMAP_NODES, 3)),
+            above=np.zeros(ROADMAP_NODES, dtype=np.int64),
+            parts=np.zeros(ROADMAP_NODES, dtype=np.int64),
+            made=np.zeros(2, dtype=np.int64),
+        ),
         totals=np.zeros(6, dtype=np.int64),
         first=np.zeros((MOST_VERTICES, 3)),
         state=seeded(seed),
