@@ -31,6 +31,7 @@ FIXED_WHILE_VALID = 0x3FFFFFFF
 MOST_BITS = 64
 LAST_SYNC_TYPE = 240
 
+PDO_OBJECTS = range(0x1400, 0x1C00)
 RPDO, RPDO_MAP, TPDO, TPDO_MAP = (range(b, b + 0x200) for b in (0x1400, 0x1600, 0x1800, 0x1A00))
 
 _LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
