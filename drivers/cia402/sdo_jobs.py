@@ -332,7 +332,6 @@ class ModeCheck:
     def next_requests(self, most: int) -> list[tuple[int, bytes]]:
         """Requests of one cycle; see `SdoJobs.next_requests`."""
         self._left -= 1
-        self._note_answers()
         if not self._jobs.unfinished():
             asked = {node: (MODE_DISPLAY,) for node in self.wrong()}
             self._jobs = SdoJobs(asked, self._again_after)
@@ -341,11 +340,7 @@ class ModeCheck:
     def take(self, node: int, data: bytes | bytearray) -> None:
         """Processes an answer; see `SdoJobs.take`."""
         self._jobs.take(node, data)
-        self._note_answers()
-
-    def _note_answers(self) -> None:
-        for (node, _), mode in self._jobs.values.items():
-            self._modes[node] = mode
+        self._modes |= {node: mode for (node, _), mode in self._jobs.values.items()}
 
     def wrong(self) -> dict[int, int | None]:
         """Nodes that are in another mode, or have not answered (None)."""
