@@ -133,8 +133,6 @@ class SimulatedDrive(PowerStage):
         self._pdos = ProcessData(self.objects)
         self.objects.judge, self.objects.changed = self._judge, self._on_changed
         self._switch_on()
-        self._deadlines = Deadlines()
-        self._read_settings()
         self._boot()
 
     def _boot(self) -> None:
@@ -142,6 +140,7 @@ class SimulatedDrive(PowerStage):
         self.nmt = NmtState.BOOT_UP
         self._server = SdoServer(self.objects, self.behaviour, self._answer)
         self._deadlines = Deadlines()
+        self._read_settings()
         self._watched = self._heartbeat_consumers()
         self._waiting: dict[int, tuple[ReceivePdo, tuple[int, ...]]] = {}
         self._window_ends = inf
@@ -264,7 +263,6 @@ class SimulatedDrive(PowerStage):
             self._connection_lost(LIFE_GUARD)
             self.objects.restore_communication()
             self._pdos.rebuild()
-            self._read_settings()
             self._boot()
 
     def on_heartbeat(self, node: int, data: Frame) -> None:
