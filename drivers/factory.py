@@ -1,6 +1,6 @@
 """Creates the drive group of a rig file, and reads the state of its drives.
 
-A protocol and its libraries are loaded only when used.
+The libraries of a protocol are loaded only when used.
 """
 
 from __future__ import annotations
@@ -12,7 +12,18 @@ from typing import Literal
 
 import can
 
+from drivers.cia402.profile import power_bits, profile_of
+from drivers.cia402.state_machine import (
+    FAULTED,
+    HOLDS,
+    TORQUE_ON,
+    WITHOUT_TORQUE,
+    DriveState,
+    state_of,
+    without_power,
+)
 from drivers.drive_group import CycleStatus, DriveGroup, DriveSnapshot, Pump
+from drivers.odrive.messages import ERROR_FLAG, AxisState, read_layouts, state_in, state_text
 from model.rig import Rig
 
 STOPS_ALONE_WITHIN = 1.0
@@ -22,11 +33,7 @@ STOPS_ALONE_WITHIN = 1.0
 def drive_states(rig: Rig, status_words: Sequence[int]) -> tuple[str, ...]:
     """Text of the status words of a `CycleStatus`."""
     if rig.document.drives.type == "odrive":
-        from drivers.odrive.messages import state_text
-
         return tuple(state_text(word) for word in status_words)
-    from drivers.cia402.state_machine import state_of
-
     return tuple(state_of(word).value for word in status_words)
 
 
@@ -50,14 +57,11 @@ class DriveFlags:
 def drive_flags(rig: Rig, status_words: Sequence[int]) -> tuple[DriveFlags, ...]:
     """Meaning of the status words of a `CycleStatus`."""
     if rig.document.drives.type == "odrive":
-        from drivers.odrive.messages import ERROR_FLAG, AxisState, state_in
-
-        def flags_in(word: int) -> DriveFlags:
-            is_armed = state_in(word) == AxisState.CLOSED_LOOP_CONTROL
-            return DriveFlags("enabled" if is_armed else "none", bool(word & ERROR_FLAG))
-
-        return tuple(map(flags_in, status_words))
-    from drivers.cia402.state_machine import FAULTED, TORQUE_ON, DriveState, state_of
+        armed = AxisState.CLOSED_LOOP_CONTROL
+        return tuple(
+            DriveFlags("enabled" if state_in(word) == armed else "none", bool(word & ERROR_FLAG))
+            for word in status_words
+        )
 
     def flags_of(state: DriveState) -> DriveFlags:
         alone: TorqueState = "holding" if state in TORQUE_ON else "none"
@@ -76,11 +80,7 @@ def stop_alone(rig: Rig, status_words: Sequence[int]) -> tuple[bool, ...]:
         status_words: Reported status word of each drive.
     """
     if rig.document.drives.type == "odrive":
-        from drivers.odrive.messages import AxisState, state_in
-
         return tuple(state_in(word) == AxisState.IDLE for word in status_words)
-    from drivers.cia402.state_machine import DriveState, state_of
-
     return tuple(state_of(word) is DriveState.QUICK_STOP_ACTIVE for word in status_words)
 
 
@@ -105,8 +105,6 @@ def without_torque(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     """
     if rig.document.drives.type == "odrive":
         return ()
-    from drivers.cia402.state_machine import HOLDS, state_of
-
     rows = zip(rig.winches, status_words, strict=True)
     return tuple(winch.node_id for winch, word in rows if state_of(word) not in HOLDS)
 
@@ -130,8 +128,6 @@ def may_have_released(rig: Rig, missing: Sequence[bool]) -> tuple[int, ...]:
 
 def shows_no_torque(status_word: int) -> bool:
     """Whether a CiA 402 drive is certainly not enabled, nor stopped by a fault."""
-    from drivers.cia402.state_machine import WITHOUT_TORQUE, DriveState, state_of
-
     return state_of(status_word) in {*WITHOUT_TORQUE, DriveState.SWITCHED_ON}
 
 
@@ -145,9 +141,6 @@ def unready_remarks(rig: Rig, status_words: Sequence[int]) -> list[str]:
     """
     if rig.document.drives.type == "odrive":
         return []
-    from drivers.cia402.profile import power_bits, profile_of
-    from drivers.cia402.state_machine import without_power
-
     bits = power_bits(profile_of(rig))
     names: dict[str, list[str]] = {}
     for name, word in zip(rig.drive_names.values(), status_words, strict=True):
@@ -167,7 +160,6 @@ def blocked_in_fault(rig: Rig, status_words: Sequence[int]) -> tuple[int, ...]:
     if rig.document.drives.type == "odrive":
         return ()
     from drivers.cia402.monitor import blocked
-    from drivers.cia402.state_machine import state_of
 
     return tuple(blocked(dict(zip(rig.drive_names, map(state_of, status_words), strict=True))))
 
@@ -189,13 +181,10 @@ def check_drive_files(rig: Rig) -> str:
     """
     drives = rig.document.drives
     if drives.type == "cia402":
-        from drivers.cia402.profile import profile_of
-
         profile_of(rig)
         return f"CANopen, profile {drives.profile}"
     from drivers.odrive.configure import check_rig
     from drivers.odrive.endpoints import read_endpoints
-    from drivers.odrive.messages import read_layouts
 
     layouts = read_layouts(drives.dbc)
     check_rig(rig, drives, layouts)

@@ -331,7 +331,8 @@ def _write_all(
         # If a PDO refuses one object, the others fail for the same reason.
         if setting.index & PDO_OBJECTS in refused:
             continue
-        if not refusals.note(_write, network, node, setting, remarks) and _is_pdo(setting.index):
+        is_set = refusals.note(_write, network, node, setting, remarks)
+        if not is_set and 0x1400 <= setting.index < 0x1C00:
             refused.add(setting.index & PDO_OBJECTS)
     return remarks
 
@@ -348,12 +349,16 @@ def _uncross_limits(network: SetupNetwork, node: int, settings: list[Setting]) -
         settings.insert(settings.index(low), high)
 
 
-def _is_pdo(index: int) -> bool:
-    return 0x1400 <= index < 0x1C00
-
-
 def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str]) -> None:
-    """Writes one object and reads it back; a missing optional one becomes a remark."""
+    """Writes one object and reads it back; a missing optional one becomes a remark.
+
+    A refused write may be accepted, else its error is raised:
+
+    abort code  required object           optional object                      transient value
+    read-only   if it holds the value     if it holds the value, or as absent  yes
+    not now     if it holds the value     if it holds the value                no
+    another     no                        if it holds the value, or as absent  no
+    """
     client = network.client(node)
     if setting.per_mille_of is not None:
         index, sub = setting.per_mille_of
@@ -364,17 +369,16 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
     except Refused as error:
         code = error.values.get("abort_code")
         if code in OUT_OF_RANGE and setting.equivalent and setting.value != setting.equivalent[0]:
-            _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
-            return
+            return _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
         if setting.transient and code in READ_ONLY:
             return  # a fixed object, whose final value is checked later
-        may_hold = code in READ_ONLY or (code in NOT_NOW and not setting.transient)
-        if not (setting.optional or may_hold):
+        may_lack = setting.optional and code not in NOT_NOW
+        if setting.transient or not (may_lack or code in READ_ONLY | NOT_NOW):
             raise
         fixed = _fixed_value(network, node, setting)
         if fixed is not None and setting.is_kept(fixed):
             return
-        if code in NOT_NOW or not setting.optional or (fixed is not None and not setting.instead):
+        if not may_lack or (fixed is not None and not setting.instead):
             raise
         if setting.instead:
             lost = "there is no" if code in OBJECT_DOES_NOT_EXIST else "the drive refuses"
@@ -401,9 +405,7 @@ def _switch_off_used(network: SetupNetwork, node: int, profile: ProfileDocument)
     """Switches the used PDOs off, as identifiers may change only then. CiA 301, 7.5.2.35."""
     for index in used_pdos(profile):
         data = network.client(node).read(index, 1, "PDO identifier")
-        value = int.from_bytes(data, "little")
-        if not value & PDO_INVALID:
-            _switch_off(network, node, index, value)
+        _switch_off(network, node, index, int.from_bytes(data, "little"))
 
 
 def _switch_off_unused(
@@ -412,35 +414,29 @@ def _switch_off_unused(
     """Switches unused PDOs off, which load the bus or react to other frames; may be absent."""
 
     def is_there(index: int) -> bool:
-        value = _identifier_if_there(network, node, index, remarks)
-        if value is not None and not value & PDO_INVALID:
-            _switch_off(network, node, index, value)
-        return value is not None
+        try:
+            data = network.client(node).read(index, 1, "PDO identifier")
+        except Refused as error:
+            if not means_absent(error):
+                raise
+            code = error.values["abort_code"]
+            if code not in OBJECT_DOES_NOT_EXIST:
+                remarks.append(
+                    f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
+                    " if it has this PDO, it stays unchanged"
+                )
+            return False
+        _switch_off(network, node, index, int.from_bytes(data, "little"))
+        return True
 
     for_unused_pdos(profile, is_there)
 
 
-def _identifier_if_there(
-    network: SetupNetwork, node: int, index: int, remarks: list[str]
-) -> int | None:
-    """Identifier of a PDO (sub-index 1); None if it cannot be read, perhaps with a remark."""
-    try:
-        return int.from_bytes(network.client(node).read(index, 1, "PDO identifier"), "little")
-    except Refused as error:
-        if not means_absent(error):
-            raise
-        code = error.values["abort_code"]
-        if code not in OBJECT_DOES_NOT_EXIST:
-            remarks.append(
-                f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
-                " if it has this PDO, it stays unchanged"
-            )
-        return None
-
-
 def _switch_off(network: SetupNetwork, node: int, index: int, value: int) -> None:
-    off = Setting(
-        *(index, 1, "<I", value | PDO_INVALID, "PDO identifier", "switched off"),
-        mask=PDO_IDENTIFIER,
-    )
-    _write(network, node, off, [])
+    """Sets bit 31 of a PDO's identifier, unless it is set."""
+    if not value & PDO_INVALID:
+        off = Setting(
+            *(index, 1, "<I", value | PDO_INVALID, "PDO identifier", "switched off"),
+            mask=PDO_IDENTIFIER,
+        )
+        _write(network, node, off, [])

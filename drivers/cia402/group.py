@@ -106,9 +106,8 @@ class Cia402Group(CyclicGroup):
         self._targets, self._demands = [0] * count, [0] * count
         self._faults = []
         self._cycle = self._cycles_to_goal = 0
-        # "Enable operation" was sent for this goal; replies to the former one's words are awaited.
-        self._enables = self._is_new_goal = self._known = False
-        self._former = self._goal, self._enables
+        self._enables = False  # "enable operation" was sent for this goal
+        self._former: tuple[Goal, bool] | None = None  # goal and that of words not replied to yet
         self._monitoring_off: MonitoringEnd | None = None
         self._modes: ModeCheck | None = None
         self._poll = StatePoll((), 1)
@@ -205,11 +204,11 @@ class Cia402Group(CyclicGroup):
             self._latch(self._new_messages())
         following = self._state is GroupState.ENABLED
         words = self._sent.next_words(self._goal, self._watch.states_to_command)
-        if self._is_new_goal and self._goal in (Goal.ENABLE, Goal.RELEASE):
+        if self._former is not None and self._goal in (Goal.ENABLE, Goal.RELEASE):
             # No further step until every drive has shown the effect of the last words.
             words = self._sent.words
         self._enables |= ControlWord.ENABLE_OPERATION in words
-        self._demands = self._targets if self._known else list(self._watch.positions)
+        self._demands = self._targets if self._cycle else list(self._watch.positions)
         if following:
             self._targets = [int(target) for target in targets]
         elif ControlWord.ENABLE_OPERATION not in self._sent.words:
@@ -217,7 +216,6 @@ class Cia402Group(CyclicGroup):
             # Once enabling has begun they are fixed, so that they do not follow a sagging drive.
             self._targets = list(self._watch.positions)
         self._send(words, may_send)
-        self._known = True
         self._cycle += 1
         if self._cycle % self._heartbeat_cycles == 0:
             self._cyclic.send((self._frames.heartbeat,))
@@ -307,7 +305,7 @@ class Cia402Group(CyclicGroup):
         warnings = self._watch.warnings()
         self._warnings = warnings if powered else ()
         # Replies show the effect of earlier words, at first those of the former goal.
-        goal, enables = self._former if self._is_new_goal else (self._goal, self._enables)
+        goal, enables = self._former or (self._goal, self._enables)
         own = self._watch.changes_on_their_own(goal, enables=enables)
         if self._state is GroupState.ENABLED and self._profile.follows_bit is not False:
             own += self._watch.ignoring_targets()
@@ -338,7 +336,8 @@ class Cia402Group(CyclicGroup):
         """Checks whether the goal is reached or overdue."""
         states = self._watch.states_to_command
         self._cycles_to_goal += 1
-        self._is_new_goal &= not self._watch.complete
+        if self._watch.complete:
+            self._former = None
         if self._goal is Goal.RESET_FAULT:
             self._watch.take_errors(self._errors.values)
             if self._cycles_to_goal > self._reset_cycles or DriveState.FAULT not in states:
@@ -418,7 +417,7 @@ class Cia402Group(CyclicGroup):
         self._former = self._goal, self._enables
         self._goal, self._cycles_to_goal = goal, 0
         self._modes, self._errors = None, SdoJobs({}, 1)
-        self._enables, self._is_new_goal = False, True
+        self._enables = False
         self._watch.leave_in_fault(self._faults if goal is Goal.RELEASE else ())
 
     def require_releasable(self) -> None:

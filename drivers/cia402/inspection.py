@@ -83,7 +83,7 @@ class ObjectRow:
     found: dict[str, list[int]] = field(default_factory=dict)
 
     def note(self, node: int, text: str, verdict: Verdict = "ok", change: str = "") -> None:
-        """Adds the value of one drive."""
+        """Adds the value of one drive; ``change`` counts for a verdict that is not ok."""
         self.found.setdefault(text, []).append(node)
         if _WORST.index(verdict) > _WORST.index(self.verdict):
             self.verdict, self.change = verdict, change
@@ -223,12 +223,10 @@ class _Reader:
         row = self._row(expected.index, expected.sub, str(expected), f"{expected.expected:X}h")
         row.meaning = expected.why
         data = self._read(expected.index, expected.sub, row, expected.optional)
-        if data is None:
-            return
-        value = int.from_bytes(data, "little")
-        good = value & expected.mask == expected.expected
-        change = "" if good else how_to_set(expected)
-        row.note(self._node, f"{value:X}h", "ok" if good else otherwise, change)
+        if data is not None:
+            value = int.from_bytes(data, "little")
+            good = value & expected.mask == expected.expected
+            row.note(self._node, f"{value:X}h", "ok" if good else otherwise, how_to_set(expected))
 
     def at_state(self) -> None:
         """State of the drive's state machine, with the error of one in fault."""
@@ -278,10 +276,8 @@ class _Reader:
         row.meaning = "position counts per motor turn: winches[].counts_per_rev"
         row.needed = row.needed or f"{counts_per_turn} per turn, if the drive has them"
         text = ", ".join(f"{value:.10g} from {name}" for name, value in scales.items()) or "absent"
-        if wrong is None:
-            row.note(self._node, text)
-        else:
-            row.note(self._node, text, "wrong" if wrong.certain else "remark", HOW_SCALED)
+        verdict: Verdict = "ok" if wrong is None else "wrong" if wrong.certain else "remark"
+        row.note(self._node, text, verdict, HOW_SCALED)
 
     def at_position_range(self, settings: Sequence[Setting]) -> None:
         """Where positions wrap around, if anywhere."""
@@ -296,8 +292,7 @@ class _Reader:
             row.note(self._node, text, "wrong", "see the drive's manual")
             return
         good = holds_limits(found, settings)
-        change = "" if good else BY_MAKERS_TOOL
-        row.note(self._node, str(found or "none"), "ok" if good else "wrong", change)
+        row.note(self._node, str(found or "none"), "ok" if good else "wrong", BY_MAKERS_TOOL)
 
     def at_setting(self, setting: Setting, needed: str) -> None:
         """An object written by the configuration, which must exist with the right length."""
@@ -333,9 +328,8 @@ class _Reader:
         data = self._read(setting.index, setting.sub, row, optional=True, size=setting.size)
         if data is not None:
             text = setting.text(int.from_bytes(data, "little"))
-            good = setting.is_kept(data)
-            change = "" if good else "remove it from `absent` in the drive profile"
-            row.note(self._node, text, "ok" if good else "wrong", change)
+            change = "remove it from `absent` in the drive profile"
+            row.note(self._node, text, "ok" if setting.is_kept(data) else "wrong", change)
 
     def at_unused(self, index: int) -> bool:
         """An unused PDO, which is switched off if it exists; returns whether it exists."""

@@ -38,10 +38,6 @@ from drivers.plausibility import ReplyCheck
 from model.errors import Refused
 
 
-def _never(_code: int) -> bool:
-    return False
-
-
 def blocked(states: Mapping[int, DriveState]) -> list[int]:
     """Nodes in fault that may not be reset, as another drive holds the platform."""
     faulted = [node for node, state in states.items() if state in FAULTED]
@@ -59,7 +55,7 @@ class DriveMonitor:
         self,
         names: Mapping[int, str],
         max_steps: Sequence[float],
-        is_warning: Callable[[int], bool] = _never,
+        is_warning: Callable[[int], bool] = lambda _code: False,
         heartbeat_cycles: float = inf,
         power_bits: int = POWER_BITS,
     ) -> None:

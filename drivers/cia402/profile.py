@@ -111,17 +111,8 @@ def used_pdos(profile: ProfileDocument) -> tuple[int, int]:
     return rpdo_parameters(profile.rpdo), tpdo_parameters(profile.tpdo)
 
 
-def unused_pdos(profile: ProfileDocument) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Communication parameters of unused RPDOs and TPDOs, which are switched off."""
-    kinds = zip(_FIRST_PDOS, used_pdos(profile), strict=True)
-    received, sent = (
-        tuple(i for i in range(at, at + MOST_PDOS) if i != used) for at, used in kinds
-    )
-    return received, sent
-
-
 def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -> None:
-    """Visits the unused PDOs that a drive may have.
+    """Visits the unused PDOs that a drive may have, which are switched off.
 
     All of 1 to 4; beyond these PDOs are numbered without a gap, so that the first absent one ends
     the search.
@@ -129,9 +120,9 @@ def for_unused_pdos(profile: ProfileDocument, is_there: Callable[[int], bool]) -
     Args:
         is_there: Called with the communication parameters of each; returns whether it exists.
     """
-    for indices, first in zip(unused_pdos(profile), _FIRST_PDOS, strict=True):
-        for index in indices:
-            if not is_there(index) and index >= first + STANDARD_PDOS:
+    for first, used in zip(_FIRST_PDOS, used_pdos(profile), strict=True):
+        for index in range(first, first + MOST_PDOS):
+            if index != used and not is_there(index) and index >= first + STANDARD_PDOS:
                 break
 
 

@@ -34,6 +34,7 @@ from drivers.cia402.pdo import (
     make_nmt,
     parse_heartbeat,
 )
+from drivers.cia402.sdo_jobs import SdoRequest, parse_value
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import Pump
 from drivers.setup_refusals import SETTING_UP, DriveRestarted
@@ -286,7 +287,7 @@ class Client:
 
     def ask_device_type(self) -> None:
         """Sends the request of first contact; see `waits`."""
-        self._ask(_upload(0x1000, 0), (_UPLOAD, 0x1000, 0))
+        self._ask(SdoRequest(0x1000, 0).frame(), (_UPLOAD, 0x1000, 0))
 
     def give_up(self) -> None:
         """Stops waiting for the answer to the open request."""
@@ -331,16 +332,13 @@ class Client:
             Refused: It aborts the transfer.
         """
         target = f"{index:04X}h:{sub:02X} {name}"
-        request = _HEAD.pack(0x23 | (4 - len(data)) << 2, index, sub) + data.ljust(4, b"\0")
+        request = SdoRequest(index, sub, data).frame()
         self._attempt(lambda: self._exchange(request, (_DOWNLOAD, index, sub)), target)
 
     def _read(self, index: int, sub: int, size: int) -> bytes:
-        reply = self._exchange(_upload(index, sub), (_UPLOAD, index, sub))
-        command = reply[0]
-        if command & 0x02:  # expedited: the data are in this frame
-            stated = 4 - (command >> 2 & 0x03) if command & 0x01 else size
-            return reply[4 : 4 + stated]
-        return self._read_segments(index, sub)
+        reply = self._exchange(SdoRequest(index, sub).frame(), (_UPLOAD, index, sub))
+        is_expedited = reply[0] & 0x02
+        return parse_value(reply, size) if is_expedited else self._read_segments(index, sub)
 
     def _read_segments(self, index: int, sub: int) -> bytes:
         """Reads the data of a segmented transfer, in segments of up to seven bytes."""
@@ -395,10 +393,6 @@ class Client:
                     next_step="check cable, termination and bit rate",
                 ) from error
         raise AssertionError("the last attempt either returned or raised")
-
-
-def _upload(index: int, sub: int) -> bytes:
-    return _HEAD.pack(0x40, index, sub) + bytes(4)
 
 
 def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:

@@ -24,11 +24,9 @@ MODE_WAIT = 0.5
 CSP_MODE = 8
 """Cyclic synchronous position."""
 
-_DOWNLOAD = {1: 0x2F, 2: 0x2B, 4: 0x23}
-_UPLOAD = 0x40
 _DOWNLOADED, _ABORTED = 0x60, 0x80
-_UPLOADED = {0x4F: 1, 0x4B: 2, 0x47: 3, 0x43: 4}
-_SIZE_NOT_STATED = 0x42
+_UPLOADED = frozenset({0x4F, 0x4B, 0x47, 0x43, 0x42})
+"""Answers with 1 to 4 bytes, and one that does not state their number."""
 _SEGMENTS_FOLLOW = frozenset({0x40, 0x41})
 _ASK_FOR_SEGMENT = bytes((0x60, *bytes(7)))
 _LENGTH = 8
@@ -44,7 +42,7 @@ class SdoRequest:
     Attributes:
         index: Object index.
         sub: Sub-index.
-        data: 1, 2 or 4 bytes to write; empty to read.
+        data: 1 to 4 bytes to write; empty to read.
         size: Size of a read value if the answer does not state it, [bytes].
     """
 
@@ -55,9 +53,15 @@ class SdoRequest:
 
     def frame(self) -> bytes:
         """Data of the request frame."""
-        command = _DOWNLOAD[len(self.data)] if self.data else _UPLOAD
+        command = 0x23 | (4 - len(self.data)) << 2 if self.data else 0x40
         head = bytes((command, self.index & 0xFF, self.index >> 8, self.sub))
         return head + self.data.ljust(4, b"\0")
+
+
+def parse_value(data: bytes | bytearray, size: int) -> bytes:
+    """Value in an answer of one frame; of ``size`` [bytes] if the answer does not state it."""
+    stated = 4 - (data[0] >> 2 & 3) if data[0] & 1 else size
+    return bytes(data[4 : 4 + stated])
 
 
 #: State of a drive: status word, position [counts] and torque [per mille].
@@ -207,9 +211,8 @@ class SdoJobs:
             self.failed[node, job] = int.from_bytes(data[4:8], "little")
         elif job.data and data[0] == _DOWNLOADED:
             pass
-        elif not job.data and (data[0] in _UPLOADED or data[0] == _SIZE_NOT_STATED):
-            size = _UPLOADED.get(data[0], job.size)
-            self.values[node, job] = int.from_bytes(data[4 : 4 + size], "little")
+        elif not job.data and data[0] in _UPLOADED:
+            self.values[node, job] = int.from_bytes(parse_value(data, job.size), "little")
         elif not job.data and data[0] in _SEGMENTS_FOLLOW:
             self._frames[node], self._turns[node] = _ASK_FOR_SEGMENT, self._again_after
             return
@@ -329,7 +332,6 @@ class ModeCheck:
     def next_requests(self, most: int) -> list[tuple[int, bytes]]:
         """Requests of one cycle; see `SdoJobs.next_requests`."""
         self._left -= 1
-        self._note_answers()
         if not self._jobs.unfinished():
             asked = {node: (MODE_DISPLAY,) for node in self.wrong()}
             self._jobs = SdoJobs(asked, self._again_after)
@@ -338,11 +340,7 @@ class ModeCheck:
     def take(self, node: int, data: bytes | bytearray) -> None:
         """Processes an answer; see `SdoJobs.take`."""
         self._jobs.take(node, data)
-        self._note_answers()
-
-    def _note_answers(self) -> None:
-        for (node, _), mode in self._jobs.values.items():
-            self._modes[node] = mode
+        self._modes |= {node: mode for (node, _), mode in self._jobs.values.items()}
 
     def wrong(self) -> dict[int, int | None]:
         """Nodes that are in another mode, or have not answered (None)."""

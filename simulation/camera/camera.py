@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -36,9 +35,6 @@ from simulation.camera.rendering import (
 from simulation.ground_truth import Optics
 from tracking.camera_model import encoded, pixels_of, rays_of
 from tracking.rolling_shutter import PlatformMotion
-
-if TYPE_CHECKING:
-    from simulation.camera.rendering import Image8
 
 # Effects of lamps, shadows and the camera's image processing.
 #

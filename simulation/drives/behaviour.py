@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -83,6 +84,9 @@ class DriveBehaviour:
 
 STRICT = DriveBehaviour()
 
+Put = Callable[[DriveBehaviour, str], DriveBehaviour]
+"""Returns a behaviour with one added, given its value."""
+
 
 @dataclass(frozen=True, slots=True)
 class NamedBehaviour:
@@ -100,18 +104,23 @@ class NamedBehaviour:
     value: str
     example: str
     text: str
-    put: Callable[[DriveBehaviour, str], DriveBehaviour]
+    put: Put
 
 
-def _switch(**changes: Any) -> Callable[[DriveBehaviour, str], DriveBehaviour]:
-    return lambda behaviour, _text: replace(behaviour, **changes)
+def _switch(name: str, text: str, **changes: Any) -> NamedBehaviour:
+    """A behaviour without a value."""
+    return NamedBehaviour(name, "", "", text, lambda behaviour, _: replace(behaviour, **changes))
 
 
 def _number(
-    key: str, scale: float = 1.0, low: float = 0.0, high: float = 1e9
-) -> Callable[[DriveBehaviour, str], DriveBehaviour]:
+    key: str,
+    scale: float = 1,
+    low: float = 0.0,
+    high: float = 1e9,
+    read: Callable[[str], float] = float,
+) -> Put:
     def put(behaviour: DriveBehaviour, text: str) -> DriveBehaviour:
-        value = float(text)
+        value = read(text)
         if not low <= value <= high:
             raise ValueError
         changes: dict[str, Any] = {key: value * scale}
@@ -120,15 +129,8 @@ def _number(
     return put
 
 
-def _count(key: str, base: int = 10) -> Callable[[DriveBehaviour, str], DriveBehaviour]:
-    def put(behaviour: DriveBehaviour, text: str) -> DriveBehaviour:
-        value = int(text, base)
-        if not 1 <= value <= 0xFFFF:
-            raise ValueError
-        changes: dict[str, Any] = {key: value}
-        return replace(behaviour, **changes)
-
-    return put
+def _count(key: str, base: int = 10) -> Put:
+    return _number(key, low=1, high=0xFFFF, read=partial(int, base=base))
 
 
 _OBJECT = re.compile(r"([0-9a-f]{4})h?(?::([0-9a-f]{1,2}))?$", re.IGNORECASE)
@@ -160,9 +162,7 @@ def _range(behaviour: DriveBehaviour, text: str) -> DriveBehaviour:
 
 
 BEHAVIOURS: tuple[NamedBehaviour, ...] = (
-    NamedBehaviour(
-        "strict", "", "", "CiA 301 and CiA 402 as written; the default", lambda b, _text: b
-    ),
+    _switch("strict", "CiA 301 and CiA 402 as written; the default"),
     NamedBehaviour(
         "sync-periods",
         "PERIODS",
@@ -170,19 +170,15 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "periods of 1006h after which SYNC is overdue, from 1 to 3; strict: 3",
         _number("sync_periods", low=1.0, high=STRICT.sync_periods),
     ),
-    NamedBehaviour(
+    _switch(
         "heartbeat-loss-is-fault",
-        "",
-        "",
         "a lost heartbeat is a fault: torque off, although 6007h requests a quick stop",
-        _switch(heartbeat_loss_is_fault=True),
+        heartbeat_loss_is_fault=True,
     ),
-    NamedBehaviour(
+    _switch(
         "maps-when-operational",
-        "",
-        "",
         "a disabled PDO can be mapped in NMT operational; strict: only in pre-operational",
-        _switch(maps_when_operational=True),
+        maps_when_operational=True,
     ),
     NamedBehaviour(
         "sdo-delay", "MS", "300", "delay of every SDO answer", _number("sdo_delay", 1e-3)
@@ -222,12 +218,10 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
     NamedBehaviour(
         "mode-late", "MS", "50", "delay of 6061h after 6060h", _number("mode_delay", 1e-3)
     ),
-    NamedBehaviour(
+    _switch(
         "mode-when-enabled",
-        "",
-        "",
         "6061h follows 6060h only while the drive is enabled",
-        _switch(mode_when_enabled=True),
+        mode_when_enabled=True,
     ),
     NamedBehaviour(
         "enable-late",
@@ -243,12 +237,10 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "while enabled, a warning (EMCY code, status word bit 7) comes and goes; it keeps running",
         _count("warning", 16),
     ),
-    NamedBehaviour(
+    _switch(
         "status-flicker",
-        "",
-        "",
         "bits 4, 7 to 11 and 13 to 15 of the status word change at every SYNC",
-        _switch(flicker=True),
+        flicker=True,
     ),
     NamedBehaviour(
         "boot-late",
@@ -285,12 +277,10 @@ BEHAVIOURS: tuple[NamedBehaviour, ...] = (
         "stick-slip: the motor rests until its lag reaches this value, then jumps",
         _number("stick"),
     ),
-    NamedBehaviour(
+    _switch(
         "limits-monitored",
-        "",
-        "",
         "an actual position outside 607Dh is a fault under torque (EMCY 8612h)",
-        _switch(limits_monitored=True),
+        limits_monitored=True,
     ),
     NamedBehaviour(
         "limit-switch",

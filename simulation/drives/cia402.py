@@ -42,12 +42,10 @@ from simulation.drives.pdo import (
     ACTING,
     CONTROL_WORD,
     MODE,
-    RPDO,
-    RPDO_MAP,
+    PDO_OBJECTS,
     TARGET,
     TOLERANCE,
     TPDO,
-    TPDO_MAP,
     Deadlines,
     ProcessData,
     ReceivePdo,
@@ -135,8 +133,6 @@ class SimulatedDrive(PowerStage):
         self._pdos = ProcessData(self.objects)
         self.objects.judge, self.objects.changed = self._judge, self._on_changed
         self._switch_on()
-        self._deadlines = Deadlines()
-        self._read_settings()
         self._boot()
 
     def _boot(self) -> None:
@@ -144,6 +140,7 @@ class SimulatedDrive(PowerStage):
         self.nmt = NmtState.BOOT_UP
         self._server = SdoServer(self.objects, self.behaviour, self._answer)
         self._deadlines = Deadlines()
+        self._read_settings()
         self._watched = self._heartbeat_consumers()
         self._waiting: dict[int, tuple[ReceivePdo, tuple[int, ...]]] = {}
         self._window_ends = inf
@@ -206,8 +203,7 @@ class SimulatedDrive(PowerStage):
         self._window_ends = self._now + self._sync_window if self._sync_window else inf
         if self._sync_timeout:
             self._deadlines.expect(_SYNC, self._now + self._sync_timeout)
-            if self._errors:
-                self._clear_error(_SYNC)
+            self._clear_error(_SYNC)
         if self.behaviour.flicker:
             self._flicker = self._random.getrandbits(16) & _FLICKERING
         is_at_switch = self._is_at_switch
@@ -232,16 +228,14 @@ class SimulatedDrive(PowerStage):
             return
         if pdo.deadline:
             self._deadlines.expect(pdo.number, self._now + pdo.deadline)
-        if self._errors:
-            self._clear_error((PDO_LENGTH, pdo.number))
-            self._clear_error(pdo.number)
+        self._clear_error((PDO_LENGTH, pdo.number))
+        self._clear_error(pdo.number)
         values = pdo.form.unpack(data)
         if pdo.synchronous:
             if self._now > self._window_ends + TOLERANCE:
                 self._raise_error((PDO_LATE, pdo.number), PDO_LATE)
                 return
-            if self._errors:
-                self._clear_error((PDO_LATE, pdo.number))
+            self._clear_error((PDO_LATE, pdo.number))
             self._waiting[pdo.number] = pdo, values
         else:
             self._take(pdo, values)
@@ -269,7 +263,6 @@ class SimulatedDrive(PowerStage):
             self._connection_lost(LIFE_GUARD)
             self.objects.restore_communication()
             self._pdos.rebuild()
-            self._read_settings()
             self._boot()
 
     def on_heartbeat(self, node: int, data: Frame) -> None:
@@ -278,13 +271,12 @@ class SimulatedDrive(PowerStage):
             return
         if len(data) == 1:
             self._deadlines.expect((LIFE_GUARD, node), self._now + self._watched[node])
-            if self._errors:
-                self._clear_error((LIFE_GUARD, node))
+            self._clear_error((LIFE_GUARD, node))
 
     def _judge(self, key: Key, value: int) -> int:
         """Abort code of an SDO write in the present state; 0 to accept it."""
         index = key[0]
-        if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
+        if index in PDO_OBJECTS:
             pre_operational = self.nmt is NmtState.PRE_OPERATIONAL
             may_map = pre_operational or self.behaviour.maps_when_operational
             return self._pdos.refused(key, value, may_map=may_map)
@@ -298,9 +290,9 @@ class SimulatedDrive(PowerStage):
     def _on_changed(self, key: Key, value: int) -> None:
         """Reacts to a changed object."""
         index = key[0]
-        if index in RPDO or index in TPDO or index in RPDO_MAP or index in TPDO_MAP:
-            if index in TPDO:
-                self._drop_remote_bit(key, value)
+        if index in PDO_OBJECTS:
+            if index in TPDO and key[1] == 1:  # no remote requests: bit 30 of the COB-ID
+                self.objects.note(key, value & ~(1 << 30))
             self._pdos.rebuild()
             watched = {pdo.number for pdo in self._pdos.received.values() if pdo.deadline}
             for what in self._deadlines.kept():
@@ -318,11 +310,6 @@ class SimulatedDrive(PowerStage):
             self._write(key, value)
         else:
             self._read_settings()
-
-    def _drop_remote_bit(self, key: Key, value: int) -> None:
-        """Clears bit 30 of a TPDO's COB-ID, as remote requests are not supported."""
-        if key[1] == 1:
-            self.objects.note(key, value & ~(1 << 30))
 
     def _read_settings(self) -> None:
         """Caches settings of time-outs, so that `advance` reads no objects."""
@@ -390,7 +377,7 @@ class SimulatedDrive(PowerStage):
 
     def _clear_error(self, what: object) -> None:
         """The error is over: EMCY 0000h, with the remaining error register."""
-        if self._errors.pop(what, None) is not None:
+        if self._errors and self._errors.pop(what, None) is not None:
             self._emergency(0)
 
     def _take_waiting(self) -> None:

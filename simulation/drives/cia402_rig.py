@@ -159,17 +159,13 @@ class SimulatedCia402Rig(SimulatedRig[SimulatedDrive]):
             routes[SDO_REQUEST_BASE + drive.node] = partial(self._on_sdo, drive)
         return routes
 
-    def _routes_of_pdos(self) -> dict[int, Callable[[int, Frame], None]]:
-        """Handler of each RPDO identifier, from the drives' objects."""
-        return {can_id: drive.on_pdo for drive in self.drives for can_id in drive.pdo_ids}
-
     def _handle(self, message: can.Message) -> None:
         if message.is_extended_id or message.is_error_frame or message.is_remote_frame:
             return
         can_id = message.arbitration_id
         if can_id in PDO_IDS:
             if self._pdo_handlers is None:
-                self._pdo_handlers = self._routes_of_pdos()
+                self._pdo_handlers = {i: d.on_pdo for d in self.drives for i in d.pdo_ids}
             take_pdo = self._pdo_handlers.get(can_id)
             if take_pdo is not None:
                 take_pdo(can_id, message.data)

@@ -10,7 +10,7 @@ from itertools import count
 from math import inf
 
 from model.files.drive_profile_file import ProfileDocument, object_key
-from simulation.drives.behaviour import STRICT, DriveBehaviour
+from simulation.drives.behaviour import NOT_THERE, STRICT, DriveBehaviour
 from simulation.drives.eds_file import Eds, Key, ObjectDescription
 
 NO_DUPLICATE_CONSUMER = 0x06040043
@@ -19,7 +19,6 @@ PDO_TOO_LONG = 0x06040042
 UNSUPPORTED_ACCESS = 0x06010000
 WRITE_ONLY = 0x06010001
 READ_ONLY = 0x06010002
-NOT_THERE = 0x06020000
 WRONG_LENGTH = 0x06070010
 NO_SUB_INDEX = 0x06090011
 OUT_OF_RANGE = 0x06090030

@@ -31,6 +31,7 @@ FIXED_WHILE_VALID = 0x3FFFFFFF
 MOST_BITS = 64
 LAST_SYNC_TYPE = 240
 
+PDO_OBJECTS = range(0x1400, 0x1C00)
 RPDO, RPDO_MAP, TPDO, TPDO_MAP = (range(b, b + 0x200) for b in (0x1400, 0x1600, 0x1800, 0x1A00))
 
 _LETTERS = {1: "b", 2: "h", 4: "i", 8: "q"}
@@ -106,9 +107,9 @@ class ProcessData:
 
     def rebuild(self) -> None:
         """Rebuilds the PDOs after a change of parameters."""
-        received = (self._receive_pdo(index) for index in self._rpdos)
-        self.received: dict[int, ReceivePdo] = {i: pdo for found in received for i, pdo in found}
-        self.sent = [pdo for index in self._tpdos for pdo in self._transmit_pdo(index)]
+        received, sent = (filter(self._is_valid, each) for each in (self._rpdos, self._tpdos))
+        self.received = {self._objects[i, 1] & ID_BITS: self._receive_pdo(i) for i in received}
+        self.sent = [self._transmit_pdo(i) for i in sent if self._kind(i) <= LAST_SYNC_TYPE]
 
     def refused(self, key: Key, value: int, *, may_map: bool) -> int:
         """Abort code of a write to a parameter; 0 to accept it.
@@ -164,28 +165,25 @@ class ProcessData:
     def _is_valid(self, index: int) -> bool:
         return (index, 1) in self._objects and not self._objects[index, 1] & PDO_OFF
 
-    def _receive_pdo(self, index: int) -> list[tuple[int, ReceivePdo]]:
-        if not self._is_valid(index):
-            return []
+    def _kind(self, index: int) -> int:
+        """Transmission type."""
+        return self._objects.get((index, 2), 255)
+
+    def _receive_pdo(self, index: int) -> ReceivePdo:
         keys, form = self._mapped(index + 0x200)
-        kind = self._objects.get((index, 2), 255)
         deadline = self._objects.get((index, 5), 0) / 1000.0
-        can_id = self._objects[index, 1] & ID_BITS
         acting = sorted(
             ((at, key) for at, key in enumerate(keys) if key in ACTING),
             key=lambda one: one[1] == CONTROL_WORD,
         )
-        synchronous = kind <= LAST_SYNC_TYPE
-        pdo = ReceivePdo(index - 0x1400, synchronous, keys, tuple(acting), form, deadline)
-        return [(can_id, pdo)]
+        synchronous = self._kind(index) <= LAST_SYNC_TYPE
+        return ReceivePdo(index - 0x1400, synchronous, keys, tuple(acting), form, deadline)
 
-    def _transmit_pdo(self, index: int) -> list[TransmitPdo]:
-        kind = self._objects.get((index, 2), 255)
-        if not self._is_valid(index) or kind > LAST_SYNC_TYPE:
-            return []
+    def _transmit_pdo(self, index: int) -> TransmitPdo:
         keys, form = self._mapped(index + 0x200)
         readers = tuple(self._objects.reader(key) for key in keys)
-        return [TransmitPdo(self._objects[index, 1] & ID_BITS, max(1, kind), readers, form)]
+        can_id = self._objects[index, 1] & ID_BITS
+        return TransmitPdo(can_id, max(1, self._kind(index)), readers, form)
 
     def _mapped(self, index: int) -> tuple[tuple[Key, ...], struct.Struct]:
         keys, letters = [], ""
