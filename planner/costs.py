@@ -3,7 +3,7 @@
 The kinematic cost of a pose is c = γ_d + γ_f: the condition number of the structure matrix and the
 inverse volume of the force set, each scaled to 0..1 between its extremes over the workspace
 (paper, Eqs. 4, 5, 8 and section 3.2; see docs/paper.md for the corrections). A longest path is kept
-by `LimitedSearch`.
+by `LimitedSearch`, which also finds the clearance worth demanding.
 
 The objectives, with the weights of clearance and capacity, are in `planner.settings`; the optimal
 planner evaluates them in `planner.anytime.problem` and `planner.anytime_6d.problem`.
@@ -35,7 +35,7 @@ from model.statics.wrench_sets import condition_number, force_volume, rms_anchor
 from planner import space
 from planner.kernels.jit import stored
 from planner.settings import CLEARANCE_RESERVE, MARGIN_RESERVE, OBJECTIVES, Weights
-from planner.space import Lattice, corners_and_weights
+from planner.space import Lattice, corners_and_weights, finite_range, scaled
 
 _SAMPLING = 0.010
 _MODULES = (kinematics, wrench_sets, space)
@@ -146,21 +146,6 @@ class KinematicCost:
         return scaled(condition, *of_condition) + scaled(inverse, *of_inverse)
 
 
-def finite_range(values: Array) -> tuple[float, float]:
-    """The smallest and the largest finite value; 0 without any."""
-    finite = values[np.isfinite(values)]
-    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
-
-
-def scaled(values: Array, low: float, high: float) -> Array:
-    """An index as a cost: 0 at its best within the workspace or better, 1 at a singular pose.
-
-    An orientation other than the one of the extremes may be better than their best.
-    """
-    rising = np.maximum((values - low) / (high - low if high > low else 1.0), 0.0)
-    return np.where(np.isfinite(values), rising, 1.0)
-
-
 # Wrench feasibility: weight, payload and the box of disturbances, within the tension limits.
 
 
@@ -210,7 +195,9 @@ def capacity_margins(rig: Rig, scene: Scene, positions: Array, rotation: Array) 
 # long.
 #
 # A price of length hardly ever leads to a clearance between the least and the largest possible. So
-# clearance is not left to the price but demanded, of one search after the other.
+# clearance is not left to the price but demanded, of one search after the other; without a limit
+# too, as small changes seldom raise the clearance of a whole path. Every other round improves the
+# best path, with the clearance demanded of it.
 
 
 _CLEARANCE_ROUND_OFF = 1e-9
@@ -261,7 +248,9 @@ class LengthPrice:
 
 
 class ClearanceSteps:
-    """The clearance to demand next: higher by steps that grow with success, else are halved.
+    """The clearance to demand next: bisection below the lowest that failed.
+
+    A failure may be bad luck: from the finest step on, steps grow again with success.
 
     Attributes:
         demanded: Clearance, [m].
@@ -273,16 +262,18 @@ class ClearanceSteps:
     def __init__(self, least: float, most: float) -> None:
         """Begins with the least clearance; the first step leads to the middle, [m]."""
         self.demanded = self._best = least
-        self._most, self._step, self._grows = most, (most - least) / 2.0, False
+        self._most, self._bisects = most, False
+        self._step = (most - least) / (2.0 * self._GROWTH)
 
     def after_search(self, improved: bool) -> bool:
         """Moves on from a search; returns whether there is a higher clearance to demand."""
         if improved:
             self._best = self.demanded
-            self._step *= self._GROWTH if self._grows else 1.0
-        else:
+        if self._bisects or not improved:
             self._step = max(self._step / 2.0, self._FINEST)
-        self._grows = True
+            self._bisects = self._step > self._FINEST
+        else:
+            self._step = min(self._step * self._GROWTH, self._most - self._best)
         self.demanded = min(self._best + self._step, self._most)
         return self.demanded > self._best
 
@@ -315,21 +306,57 @@ class RoundSearch(Protocol):
 Search = TypeVar("Search", bound=RoundSearch)
 
 
+class _Stage(Generic[Search]):
+    """A search with one clearance demanded, for the shortest path at first.
+
+    Attributes:
+        search: With the objective of the current round.
+        rounds: Done so far.
+        cost: Of its best path within the limit; infinite without one.
+    """
+
+    def __init__(self, search: Search, rest: Weights, unit: float) -> None:
+        self.search, self.rounds, self.cost = search, 0, math.inf
+        self._rest, self._unit = rest, unit
+        self._price: LengthPrice | None = None
+        search.weigh(OBJECTIVES["length"])
+
+    def advance(self, longest: float, weights: Weights) -> Array | None:
+        """Does one round; returns the path if it costs less than all before, else None."""
+        search, better = self.search, None
+        search.advance()
+        self.rounds += 1
+        path, short_enough = search.path, search.length <= longest + LENGTH_ROUND_OFF
+        if path is not None and short_enough:
+            cost = search.cost_by(weights)
+            if cost < self.cost:
+                self.cost, better = cost, path
+        if self._price is not None:
+            if self._price.after_round(short_enough):
+                search.weigh(replace(self._rest, length=self._rest.length + self._price.price))
+        elif short_enough and not self._rest.is_length:
+            self._price = LengthPrice(self._unit)
+            search.weigh(self._rest)
+        return better
+
+
 class LimitedSearch(Generic[Search]):
     """Searches for the best path within a length limit, one for each clearance demanded.
 
     Attributes:
         first: The first search, with the scene's own clearance.
         path: The best path found that is short enough, shape (k, n); None without one.
+        cost: Of that path; infinite without one.
     """
 
-    _FEWEST, _FEWEST_OF_PRICES = 16, 48
-    """Rounds of a search at least; the second where λ has to be found."""
-    _SHARE = 8
+    _FEWEST, _FEWEST_EAGER, _FEWEST_WITH_LIMIT, _FEWEST_OF_PRICES = 8, 4, 16, 48
+    """Rounds of a search at least; of an eager one; with a limit; and where λ has to be found."""
+    _SHARE = 4
     """A search may take one in this many of the rounds before it."""
     _EAGER = 10.0
-    """With the length as the only other term, and clearance weighed higher by this factor, a search
-    ends with its first path within the limit: more clearance is worth more than polishing."""
+    """If a metre of clearance is worth more than this many of path, a search ends with its first
+    path that is better than all before: more clearance is worth more than polishing. Not if the
+    price of length has to be found too, or capacity counts."""
 
     def __init__(
         self,
@@ -345,81 +372,69 @@ class LimitedSearch(Generic[Search]):
             begin: Makes a search of a scene by weights.
             scene: Obstacles, clearances, start and goal.
             weights: The objective, with a scale of 1.
-            longest: Longest path allowed, [m].
+            longest: Longest path allowed, [m]; infinite for no limit.
             kinematic: The cost of poses at the start's orientation.
         """
         self.path: Array | None = None
+        self.cost = math.inf
         self._begin, self._scene = begin, scene
         self._weights, self._longest = weights, longest
         self._rest = replace(weights, clearance=0.0).normalized()
         self._unit = typical_cost(self._rest, kinematic)
-        self._eager = self._rest.is_length and weights.clearance > self._EAGER * weights.length
+        has_price = not self._rest.is_length and longest < math.inf
+        metre = typical_cost(weights, kinematic)
+        self._eager = weights.clearance > self._EAGER * metre and not (
+            has_price or weights.capacity
+        )
+        if longest < math.inf:
+            self._fewest = self._FEWEST_OF_PRICES if has_price else self._FEWEST_WITH_LIMIT
+        else:
+            self._fewest = self._FEWEST_EAGER if self._eager else self._FEWEST
         most = _largest_clearance(kinematic.rig, scene) if weights.clearance > 0.0 else 0.0
         least = scene.obstacle_clearance
         self._steps = ClearanceSteps(least, most) if least < most < math.inf else None
-        self._rounds, self._checks, self._least = 0, 0, math.inf
-        self._own_rounds, self._allowed = 0, 0
-        self._before = self._of_search = math.inf
-        self._price: LengthPrice | None = None
-        self.first = self._search = self._open(scene)
-
-    @property
-    def cost(self) -> float:
-        """Cost of the best path within the limit; infinite without one."""
-        return self._least
+        self._rounds, self._checks = 0, 0
+        self._best = self._newest = self._open(scene)
+        self.first = self._best.search
 
     @property
     def checks(self) -> int:
         """Number of edges checked."""
-        return self._checks + self._search.checks
+        newest = 0 if self._newest is self._best else self._newest.search.checks
+        return self._checks + self._best.search.checks + newest
 
     def advance(self) -> None:
         """Does one round."""
-        if self._steps is not None and self._is_done():
-            self._next(self._steps)
-        search = self._search
-        search.advance()
+        stage = self._best
+        if self.path is None or self._rounds % 2 == 0:
+            if self._steps is not None and self._is_done():
+                self._next(self._steps)
+            stage = self._newest
         self._rounds += 1
-        self._own_rounds += 1
-        path, length = search.path, search.length
-        short_enough = length <= self._longest + LENGTH_ROUND_OFF
-        if path is not None and short_enough:
-            self._record(path, search.cost_by(self._weights))
-        if self._price is not None:
-            if self._price.after_round(short_enough):
-                length_weight = self._rest.length + self._price.price
-                search.weigh(replace(self._rest, length=length_weight))
-        elif short_enough and not self._rest.is_length:
-            self._price = LengthPrice(self._unit)
-            search.weigh(self._rest)
+        path = stage.advance(self._longest, self._weights)
+        if path is not None and stage.cost < self.cost:
+            if stage is not self._best:
+                self._checks += self._best.search.checks
+            self.path, self.cost, self._best = path, stage.cost, stage
 
-    def _open(self, scene: Scene) -> Search:
-        """A new search, for the shortest path at first."""
-        search = self._begin(scene, self._rest)
-        search.weigh(OBJECTIVES["length"])
-        self._price = None
-        self._own_rounds, self._before, self._of_search = 0, self._least, math.inf
-        fewest = self._FEWEST if self._rest.is_length else self._FEWEST_OF_PRICES
-        self._allowed = max(fewest, self._rounds // self._SHARE)
-        return search
+    def _open(self, scene: Scene) -> _Stage[Search]:
+        self._allowed = max(self._fewest, self._rounds // self._SHARE)
+        self._before = self.cost
+        return _Stage(self._begin(scene, self._rest), self._rest, self._unit)
 
     def _is_done(self) -> bool:
         if self.path is None:
             return False
-        return self._own_rounds >= self._allowed or (self._eager and self._of_search < math.inf)
+        stage = self._newest
+        return stage.rounds >= self._allowed or (self._eager and stage.cost < self._before)
 
     def _next(self, steps: ClearanceSteps) -> None:
-        improved = self._of_search < self._before
-        if not steps.after_search(improved):
+        if not steps.after_search(self._newest.cost < self._before):
             self._steps = None
             return
-        self._checks += self._search.checks
-        self._search = self._open(self._scene.changed(clearance=steps.demanded))
-
-    def _record(self, path: Array, cost: float) -> None:
-        self._of_search = min(self._of_search, cost)
-        if cost < self._least:
-            self._least, self.path = cost, path
+        if self._newest is not self._best:
+            self._checks += self._newest.search.checks
+        self._newest = self._open(self._scene.changed(clearance=steps.demanded))
 
 
 def typical_cost(weights: Weights, kinematic: KinematicCost) -> float:

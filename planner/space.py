@@ -1,4 +1,4 @@
-"""The search space: the coordinates of a pose, and their bounds."""
+"""The search space: coordinates and bounds of a pose, and a lattice with costs over it."""
 
 from __future__ import annotations
 
@@ -133,3 +133,21 @@ def corners_and_weights(lattice: Lattice, points: Array) -> tuple[NDArray[np.int
 
 
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+
+
+# An index over the workspace as a cost.
+
+
+def finite_range(values: Array) -> tuple[float, float]:
+    """The smallest and the largest finite value; 0 without any."""
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 0.0)
+
+
+def scaled(values: Array, low: float, high: float) -> Array:
+    """An index as a cost: 0 at its best within the workspace or better, 1 at a singular pose.
+
+    An orientation other than the one of the extremes may be better than their best.
+    """
+    rising = np.maximum((values - low) / (high - low if high > low else 1.0), 0.0)
+    return np.where(np.isfinite(values), rising, 1.0)

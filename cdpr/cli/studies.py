@@ -48,7 +48,7 @@ def workspace(
         "platform orientation (default: the scene's start, else home)"
     ),
     length_mm: float | None = option(
-        "characteristic length for moments (default: the anchors' mean radius)",
+        "characteristic length for moments (default: the anchors' RMS radius)",
         "--characteristic-length-mm",
     ),
     workers: int | None = WORKERS,

@@ -308,7 +308,7 @@ def optimal_route(
         return CompiledSearch(rig, at, by, kinematic, settings.seed)
 
     to_do: CompiledSearch | LimitedSearch[CompiledSearch]
-    if settings.longest < math.inf:
+    if weights.clearance > 0.0 or settings.longest < math.inf:
         to_do = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
         search = to_do.first
     else:

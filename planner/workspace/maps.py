@@ -24,8 +24,7 @@ from model.statics.wrench_sets import (
     force_volume,
     rms_anchor_radius,
 )
-from planner.costs import finite_range, scaled
-from planner.space import Lattice
+from planner.space import Lattice, finite_range, scaled
 
 Values = dict[str, Array]
 OBSTACLE_CLEARANCE = "obstacle_clearance"

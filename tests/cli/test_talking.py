@@ -272,6 +272,14 @@ def test_numbers_that_are_not_known_are_null(finished_run: Path) -> None:
     assert summary["lateness_ms"] is None
 
 
+def test_the_radius_that_divides_moments_is_stated_to_be_the_root_mean_square() -> None:
+    page = (ROOT / "docs" / "workspace.md").read_text()
+    shown = " ".join(re.sub("[│╭╮╰╯─]", " ", call("workspace", "--help").out).split())
+    for text in (page, shown):
+        assert "RMS radius" in text
+        assert "mean radius" not in text
+
+
 def test_every_verb_and_option_is_documented() -> None:
     """Except of `workspace`, whose page is its help."""
     page = (ROOT / "docs" / "command-line.md").read_text()

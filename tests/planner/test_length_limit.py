@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tracemalloc
 
 import numpy as np
@@ -70,6 +71,7 @@ class Fake:
     checks = 1
 
     def __init__(self, scene: Scene, shortest: float) -> None:
+        self.rounds = 0
         self.clearance = scene.obstacle_clearance
         self.path: Array | None = np.array([[0.0, 0.0, 0.3], [0.3, 0.0, 0.3]])
         self.length = self._shortest = shortest
@@ -77,6 +79,7 @@ class Fake:
 
     def advance(self) -> None:
         """Every round finds the same path."""
+        self.rounds += 1
 
     def weigh(self, weights: Weights) -> None:
         self.objectives.append(weights)
@@ -112,6 +115,32 @@ def test_the_shortest_path_is_sought_until_the_limit_is_kept(gachon: Rig) -> Non
     search.advance()
     assert search.path is fake.path
     assert fake.objectives[-1] == OBJECTIVES["kinematic"]
+
+
+def test_the_largest_clearance_is_demanded_without_a_limit_and_its_path_improved(
+    gachon: Rig, ready_scene
+) -> None:
+    """Improved in every other round, while higher clearances are tried in vain."""
+    scene, kinematic, most = ready_scene("environment_3"), KinematicCost(gachon, np.eye(3)), 0.0305
+    begun: list[Fake] = []
+
+    def begin(at: Scene, _: Weights) -> Fake:
+        begun.append(Fake(at, 0.3 if at.obstacle_clearance <= most else math.inf))
+        if at.obstacle_clearance > most:
+            begun[-1].path = None
+        return begun[-1]
+
+    search = LimitedSearch(begin, scene, OBJECTIVES["clearance"], math.inf, kinematic)
+    costs = []
+    for _ in range(1000):
+        search.advance()
+        costs.append(search.cost)
+    best = max((fake for fake in begun if fake.path is not None), key=lambda f: f.clearance)
+    assert search.path is best.path
+    assert best.clearance == pytest.approx(most, abs=4e-5)
+    assert best.rounds > 250
+    assert costs == sorted(costs, reverse=True)
+    assert search.checks == len(begun)
 
 
 def test_the_gap_between_two_full_trees_is_exact_and_takes_little_memory() -> None:

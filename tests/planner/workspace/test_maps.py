@@ -21,7 +21,8 @@ from model.rig import Rig
 from model.scene import Scene, empty_scene, legs_of
 from planner import parallel
 from planner.check import NEAR_AXIS, check_path
-from planner.costs import KinematicCost, capacity_margins, finite_range
+from planner.costs import KinematicCost, capacity_margins
+from planner.space import finite_range
 from planner.workspace import compute as computing
 from planner.workspace.compute import VERDICTS, compute
 from planner.workspace.grid import slice_through, volume
