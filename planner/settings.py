@@ -160,14 +160,16 @@ OBJECTIVES = {
 """Weights of the named objectives."""
 
 
-LEAST_ROUNDS, LEAST_ROUNDS_WITH_LIMIT = 12, 80
-"""Done whatever the clock says, so that a busy machine finds a path too; with a limit of the length
-its price changes only every few rounds."""
+LEAST_ROUNDS, LEAST_ROUNDS_WITH_CLEARANCE, LEAST_ROUNDS_WITH_LIMIT = 12, 30, 80
+"""Done whatever the clock says, so that a busy machine finds a path too; with clearance some eight
+searches begin in them; with a limit of the length its price changes only every few rounds."""
 
 
-def least_rounds(has_limit: bool) -> int:
-    """Rounds that a search does at least, with a limit of the length or without."""
-    return LEAST_ROUNDS_WITH_LIMIT if has_limit else LEAST_ROUNDS
+def least_rounds(*, has_limit: bool, has_clearance: bool) -> int:
+    """Rounds that a search does at least: with a limit of the length, or a weight of clearance."""
+    if has_limit:
+        return LEAST_ROUNDS_WITH_LIMIT
+    return LEAST_ROUNDS_WITH_CLEARANCE if has_clearance else LEAST_ROUNDS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -145,10 +145,11 @@ def _least_rounds(document: PlanDocument) -> list[tuple[str, str]]:
     if not isinstance(planner, OptimalPlannerDocument) or planner.budget_ms is None:
         return []
     legs = len(planner.rounds)
-    if (
-        min(planner.rounds) > least_rounds(has_limit=planner.longest_mm is not None)
-        or spent < planner.budget_ms * legs
-    ):
+    least = least_rounds(
+        has_limit=planner.longest_mm is not None,
+        has_clearance=planner.name == "optimal" and planner.weights.clearance > 0.0,
+    )
+    if min(planner.rounds) > least or spent < planner.budget_ms * legs:
         return []
     wanted = math.ceil(spent / legs / 10.0) * 100
     return [("rounds", f"only the minimum; --budget-ms {wanted} allows about ten times as many")]

@@ -422,7 +422,9 @@ def _improve(
 
 def _is_over(search: CompiledSearch, settings: OptimalSettings, rounds: int, spent: float) -> bool:
     begun = int(search.state.totals[RESTARTED])
-    least = least_rounds(has_limit=settings.longest < math.inf)
+    least = least_rounds(
+        has_limit=settings.longest < math.inf, has_clearance=settings.weights.clearance > 0.0
+    )
     if search.problem.terms[LEAST_MARGIN] == ASK_PROOF:
         least = LEAST_WITH_PROOFS
     return settings.is_over(rounds, spent, begun + least)

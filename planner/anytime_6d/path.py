@@ -277,7 +277,8 @@ def _load(search: RotatingSearch, weights: Weights) -> None:
 def _is_over(settings: TurningSettings, search: RotatingSearch, rounds: int, spent: float) -> bool:
     if settings.weights.is_length and search.cost <= search.shortest * (1.0 + 1e-12):
         return True
-    least = least_rounds(has_limit=settings.longest < math.inf)
+    has_limit = settings.longest < math.inf
+    least = least_rounds(has_limit=has_limit, has_clearance=False)  # is demanded with a limit only
     return settings.is_over(rounds, spent, least)
 
 

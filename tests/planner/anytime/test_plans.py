@@ -207,10 +207,10 @@ def test_the_largest_clearance_is_found_without_a_limit_of_the_length(
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_passage_a_tenth_of_a_millimetre_wide_is_found(gachon, ready_scene, seed) -> None:
-    """The widest passage through environment 3 keeps 28.905 mm, less 0.05 mm of reserve."""
-    scene = ready_scene("environment_3").changed(clearance=0.02875)
+    """The widest known through environment 3 keeps 31.053 mm, of which 0.05 mm are a reserve."""
+    scene = ready_scene("environment_3").changed(clearance=0.0309)
     document = made(gachon, scene, rounds=60, seed=seed)
-    assert document.quality.obstacle_clearance.distance_mm >= 28.75
+    assert document.quality.obstacle_clearance.distance_mm >= 30.9
 
 
 def test_a_free_straight_line_is_found_at_once(gachon, scene_with) -> None:
