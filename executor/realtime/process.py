@@ -114,7 +114,8 @@ class MotionHere:
         if self._loop is None:
             raise Refused("the motion was not armed", where="executor")
         state = self._loop.run()
-        return Ended(state, self._loop.cause, self._loop.holding, self._drives.true_pose_now())
+        true_pose = self._drives.true_pose_now() if state is State.FINISHED else None
+        return Ended(state, self._loop.cause, self._loop.holding, true_pose)
 
     def read_status(self) -> CycleStatus:
         """See `Mover`."""
@@ -134,6 +135,7 @@ def real_time_process(
     """A process for one motion; ends when the block is left.
 
     Args:
+        motion: The caller closes it.
         make_drives: Opens and configures the drives; called in that process; picklable.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
         check_drives: Reads the state of drives whose process is gone; returns what is wrong, empty
