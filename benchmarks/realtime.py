@@ -34,17 +34,19 @@ import numpy as np
 from drivers.can_load import SLOWEST_TENTHS_MS, TESTED_HZ, check_bus_load
 from executor.control.path_runs import run_along_path
 from executor.drives import drives_of
-from executor.realtime.process import real_time_process
+from executor.realtime.scheduling import SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.recorder import Recorder
 from executor.recording.run_folder import RunFolder
 from executor.remote.status import RunStatus
 from executor.trajectory.setpoints import PreparedRun, prepare
+from executor.winch_runs import open_mover
 from model.errors import BadInput, CdprError
 from model.files.examples import PAPER_RIG
 from model.files.reading import ready_folder
 from model.plan import load_plan, save_plan
 from model.pose import Array
+from model.progress import SILENT
 from model.rig import Rig, load_rig, rig_from_document
 from model.scene import load_scene
 from planner.check import verify
@@ -135,12 +137,14 @@ def process_lateness(prepared: PreparedRun, folder: Path, seconds: float) -> Mot
     start, load = prepared.scene.start, prepared.scene.load
     outcome = run_along_path(
         prepared,
-        lambda motion: real_time_process(
+        lambda motion: open_mover(
+            prepared.rig,
             motion,
             partial(drives_of, prepared.rig.document, start, load),
             board,
-            need_real_time=False,
-            check_drives=lambda _released: "",  # the drives end with their process
+            SimulatedClock(cycle),
+            need_real_time_rights=False,
+            listener=SILENT,
         ),
         recorder,
         before_motion=note_start,

@@ -272,7 +272,8 @@ class _Run:
         rows, cycle = len(prepared.checked.table), prepared.checked.table.cycle
         every = cycles_per_image(asked_rate(self.cameras), cycle)
         status = RunStatus(prepared, self.folder.path, board, simulated_time=fast)
-        opening = partial(open_cameras, prepared, self.cameras, self.folder.path, board)
+        check_stop = self.commands.require_no_stop
+        opening = partial(open_cameras, prepared, self.cameras, self.folder.path, check_stop)
         with ExitStack() as stack:
             stack.enter_context(self.commands.during_motion(status))
             cameras = stack.enter_context(opening(simulated_time=fast, listener=options.listener))

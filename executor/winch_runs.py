@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
@@ -167,30 +167,29 @@ def open_mover(
     """Opens the drives of a motion: here in simulated time, else in the real-time process.
 
     Args:
+        task: The motion, which is closed.
         make_drives: Opens them; takes a `listener` where it is called in this process.
         board: Local in simulated time.
         clock: Of simulated time.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         after_stop: As for `MotionHere`.
     """
-    if isinstance(board, LocalRequests):
-        try:
+    with closing(task):
+        if isinstance(board, LocalRequests):
             with make_drives(listener=listener) as drives:
                 yield MotionHere(task, drives, clock, board, after_stop)
-        finally:
-            task.close()
-        return
-    if simulated := is_simulated(rig):
-        ready_to_simulate(listener, only_missing=True)
-    with real_time_process(
-        task,
-        make_drives,
-        board,
-        need_real_time=need_real_time_rights and not simulated,
-        check_drives=partial(abandoned_drives_fault, rig.document),
-        listener=listener,
-    ) as process:
-        yield process
+            return
+        if simulated := is_simulated(rig):
+            ready_to_simulate(listener, only_missing=True)
+        with real_time_process(
+            task,
+            make_drives,
+            board,
+            need_real_time=need_real_time_rights and not simulated,
+            check_drives=partial(abandoned_drives_fault, rig.document),
+            listener=listener,
+        ) as process:
+            yield process
 
 
 @contextmanager

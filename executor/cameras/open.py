@@ -26,9 +26,8 @@ from executor.cameras.sources import SYNTHETIC, cycles_per_image
 from executor.kernels import ready_to_measure
 from executor.realtime.shared_memory import SharedMemory
 from executor.recording.run_folder import RunFolder
-from executor.supervision import RequestBoard
 from model.clearance import ClearanceModel
-from model.errors import Fault, StoppedByOperator
+from model.errors import Fault
 from model.files.rig_file import RigDocument
 from model.files.scene_file import SceneDocument
 from model.pose import Array, Pose, interpolate
@@ -50,7 +49,7 @@ def open_cameras(
     prepared: PreparedRun,
     sources: Mapping[Camera, str],
     folder: Path,
-    board: RequestBoard,
+    check_stop: Callable[[], None],
     *,
     simulated_time: bool,
     listener: Listener,
@@ -60,12 +59,11 @@ def open_cameras(
     Args:
         sources: From `resolve_cameras`.
         folder: The run folder, which keeps about `KEPT_IMAGES` of each camera's images.
-        board: A stop request ends the opening.
+        check_stop: Called repeatedly; an exception ends the opening.
         simulated_time: The run waits for late images instead of dropping them.
         listener: Receives the wait, and a remark on what cannot be measured.
 
     Raises:
-        StoppedByOperator: A stop was requested before all were open.
         CdprError: A camera cannot be used.
     """
     if not sources:
@@ -95,7 +93,7 @@ def open_cameras(
             processes[camera] = process
         names = ", ".join(camera.name for camera in sources)
         with listener.waiting(f"opening camera {names}"):
-            wait_until_ready(list(processes.values()), partial(require_no_stop, board))
+            wait_until_ready(list(processes.values()), check_stop)
         yield RunCameras(
             [
                 CameraClient(process, sources[camera], lives[camera].descriptor)
@@ -125,18 +123,6 @@ def report_unmeasured_rotation(rig: Rig, rotations: Array, listener: Listener) -
 def asked_rate(sources: Mapping[Camera, str]) -> float:
     """Common frame rate of the cameras, [Hz]: that of the slowest, or of progress without any."""
     return min((camera.rate for camera in sources), default=PROGRESS_RATE)
-
-
-def require_no_stop(board: RequestBoard) -> None:
-    """Requires that no stop is requested.
-
-    Raises:
-        StoppedByOperator: A stop is requested.
-    """
-    if board.read().stop:
-        raise StoppedByOperator(
-            "stopped before anything moved", next_step="run it again when ready"
-        )
 
 
 def make_worker(

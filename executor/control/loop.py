@@ -38,11 +38,12 @@ GONE = 10
 class Loop:
     """One run of checked set-points on one drive group.
 
-    A subclass is another motion. It overrides `_follow`, `_index` and the class attributes, and
-    uses `_send`, `_handle_alarms` and `_report`; `_feed`, which it may replace; `_sender`, for the
-    targets at rest and the range that the gate allows; and `_press`. It reports AT_REST to
-    `machine`; no other event. `_send` and `_handle_alarms` return after a fault only once the
-    drives were stopped and drained: while `machine.state` is as before, there was none.
+    A subclass is another motion. It may override `_follow`, `_index` and the class attributes, and
+    replace `_feed`. It uses `_rig`, `_checked`, `_send`, `_handle_alarms`, `_report`, `_press`, and
+    `_sender` for the targets at rest, their index and the range that the gate allows. It reports
+    AT_REST to `machine`; no other event. `_send` and `_handle_alarms` return after a quick stop
+    only once the drives were stopped and drained, in LATCHED. A fault that stops along the path
+    changes MOVING and HOLDING to STOPPING, and leaves STOPPING and SECURING as they are.
     """
 
     motion_phrase = "along the path"

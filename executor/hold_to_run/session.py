@@ -171,7 +171,7 @@ class _Jogs:
 
     Attributes:
         task: For the real-time process.
-        make_drives: See `move_supervised`.
+        make_drives: See `open_mover`.
         status: Reported status.
         progress: Of the jogs: the checked line, or the cable travel.
         take_cycle: Called after every cycle.

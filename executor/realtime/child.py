@@ -180,8 +180,7 @@ class Job:
         )
 
     def close(self) -> None:
-        """Releases the shared memory that it and its motion made."""
-        self.motion.close()
+        """Releases the shared memory that it made."""
         for memory in (self.cycles, self.events):
             memory.close()
 
@@ -215,7 +214,8 @@ class Ended:
         state: Final state.
         cause: Why it did not finish, if it did not.
         holding: Every cable was held at the drives' last reply.
-        true_pose: Of the simulated platform; None on a real bus.
+        true_pose: Of the simulated platform after a finished motion; None otherwise and on a real
+            bus.
         error: The cause, where it is to be raised as an error.
     """
 
@@ -308,7 +308,7 @@ def _arm_and_run(job: Job, drives: ReadyDrives, link: Connection, supervised: Su
             master.leave_disabled()
             return
         state = loop.run()
-    true_pose = drives.true_pose_now()
+    true_pose = drives.true_pose_now() if state is State.FINISHED else None
     _send(link, Ended(state, loop.cause, loop.holding, true_pose, loop.error))
     # After any other end the supervisor may hang, and requests nothing.
     while state is State.FINISHED and isinstance(_receive(link), ReadDrives):

@@ -114,7 +114,8 @@ class MotionHere:
         if self._loop is None:
             raise Refused("the motion was not armed", where="executor")
         state = self._loop.run()
-        return Ended(state, self._loop.cause, self._loop.holding, self._drives.true_pose_now())
+        true_pose = self._drives.true_pose_now() if state is State.FINISHED else None
+        return Ended(state, self._loop.cause, self._loop.holding, true_pose)
 
     def read_status(self) -> CycleStatus:
         """See `Mover`."""
@@ -134,6 +135,7 @@ def real_time_process(
     """A process for one motion; ends when the block is left.
 
     Args:
+        motion: The caller closes it.
         make_drives: Opens and configures the drives; called in that process; picklable.
         need_real_time: Refuse to arm when the system denies real-time scheduling.
         check_drives: Reads the state of drives whose process is gone; returns what is wrong, empty
@@ -234,11 +236,11 @@ class RealTimeProcess:
         )
         self._take_in(self._records)
         is_lost = not isinstance(message, Failed)
-        self.report_event("real_time_lost" if is_lost else _event_code(error), error.what)
+        self._report_event("real_time_lost" if is_lost else _event_code(error), error.what)
         # The others should hold on their own without SYNC.
         doubt = self._check_drives(self._never_enabled)
         if doubt:
-            self.report_event("not_held", doubt)
+            self._report_event("not_held", doubt)
         cause = f"{error.what}; {doubt}" if doubt else error.what
         return Ended(State.LATCHED, cause, holding=not doubt, true_pose=None)
 
@@ -257,12 +259,6 @@ class RealTimeProcess:
             return message
         raise message.error if isinstance(message, Failed) else self._died()
 
-    def report_event(self, code: str, text: str) -> None:
-        """Records an event that happened after the last cycle."""
-        cycle, at = (self._last.cycle + 1, self._last.at) if self._last else (0, 0.0)
-        if self._records is not None:
-            self._record(partial(self._records.take_event, LoopEvent(cycle, at, code, text)))
-
     def close(self) -> None:
         """Waits for the process to come to rest and end; kills it after a time-out."""
         if not self._ended:  # after the end only the operator requests a stop
@@ -273,6 +269,12 @@ class RealTimeProcess:
             self._process.kill()
             self._process.join()
         self._process.close()
+
+    def _report_event(self, code: str, text: str) -> None:
+        """Records an event that happened after the last cycle."""
+        cycle, at = (self._last.cycle + 1, self._last.at) if self._last else (0, 0.0)
+        if self._records is not None:
+            self._record(partial(self._records.take_event, LoopEvent(cycle, at, code, text)))
 
     def _receive(self) -> object:
         """Next message of the process; None when it died."""

@@ -372,6 +372,7 @@ class Recorder:
             folder: Takes cycles and events as they happen.
             status: Updated with cycles and events.
             trigger: Called for every image.
+            every: Cycles between images.
             progress: Called regularly with the number of completed rows.
             announce: Called with a sentence when a stop is reached and left.
             on_event: Called with each event, after it is recorded.
@@ -386,8 +387,7 @@ class Recorder:
         """Writes the record; the caller closes it."""
         self._status = status
         self._trigger, self._progress = trigger, progress
-        self.every = every
-        """Cycles between images."""
+        self._every = every
         self._began: float | None = None
         self.last = 0.0
         """Start of the last cycle, on the loop's clock, [s]."""
@@ -397,7 +397,7 @@ class Recorder:
     @property
     def pose_every(self) -> int:
         """Cycles between true poses that an image needs; 0 without images."""
-        return 0 if self._trigger is None else self.every
+        return 0 if self._trigger is None else self._every
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
         """Records a cycle.
@@ -421,7 +421,7 @@ class Recorder:
                     self.take_event(LoopEvent(record.cycle, record.at, code, text))
                 except CdprError as error:
                     failure = failure or error
-        if record.cycle % self.every == 0:
+        if record.cycle % self._every == 0:
             self._progress(record.index)
             if self._trigger is not None:
                 encoder_pose = self.log.encoder_pose(record)

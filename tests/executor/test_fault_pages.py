@@ -33,6 +33,7 @@ CODE_ARGUMENT = {
     "_fault": 0,
     "_report": 0,
     "_report_cause": 0,
+    "_report_event": 0,
     "report_event": 0,
 }
 

@@ -1,32 +1,34 @@
-"""The requests of a run after the real-time process is closed."""
+"""The end of a motion in the real-time process: its cause, its requests and its memory."""
 
 from __future__ import annotations
 
 import os
 import signal
 from collections.abc import Callable
+from contextlib import nullcontext
 from functools import partial
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, Pipe
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NoReturn
 
+import numpy as np
 import pytest
 
 from drivers.can_errors import BusDown
+from executor import winch_runs
+from executor.realtime import child
 from executor.realtime import process as real_time_process
-from executor.realtime.child import CYCLE_SLOTS, Armed, Ended, Failed
-from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedRequests
+from executor.realtime.child import CYCLE_SLOTS, Armed, Ended, Failed, Go, Job, ReadyDrives
+from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedMemory, SharedRequests
 from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import Fault, HardwareMissing
+from tests.configs import GACHON
 
 
 class Still:
     """A motion that does nothing."""
 
     cables, cycle = 8, 0.004
-
-    def close(self) -> None:
-        pass
 
 
 def arms_and_ends(_job: Any, link: Connection, _supervisor: int) -> None:
@@ -226,3 +228,61 @@ def test_a_motion_that_is_over_leaves_no_stop_behind_on_the_board(
         assert board.read().stop is not goes
     finally:
         board.close()
+
+
+def test_a_simulation_that_fails_is_the_cause_of_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The true pose after the motion, which then fails as well, is not needed."""
+
+    def no_equilibrium() -> NoReturn:
+        raise Fault("the simulation failed")
+
+    cause, words = "the simulation failed; quick stop of all drives", np.full(8, QUICK)
+    loop = SimpleNamespace(
+        arm=print, run=lambda: State.LATCHED, positions=(0,) * 8, cause=cause, holding=True,
+        error=None,
+    )  # fmt: skip
+    master = SimpleNamespace(
+        status=SimpleNamespace(status_words=words), cycle_until=lambda _poll: Go()
+    )
+    motion: Any = SimpleNamespace(cables=8, cycle=0.004, loop=lambda *_: loop, require=print)
+    group: Any = SimpleNamespace(capabilities=SimpleNamespace(simulated=True))
+    drives = ReadyDrives(GACHON, group, no_equilibrium, print, ())
+    monkeypatch.setattr(child, "SyncMaster", lambda *_: master)
+    monkeypatch.setattr(child, "real_time", lambda: nullcontext(""))
+    monkeypatch.setattr(child.signal, "signal", lambda *_: None)
+    board, (near, far) = SharedRequests(), Pipe()
+    job = Job.of(motion, board.memory, lambda: nullcontext(drives), need_real_time=False)
+    try:
+        child.serve(job, far, os.getpid())
+        armed, ended = near.recv(), near.recv()
+    finally:
+        job.close()
+        board.close()
+        near.close()
+        far.close()
+    assert isinstance(armed, Armed)
+    assert isinstance(ended, Ended), ended
+    assert (ended.state, ended.cause, ended.holding) == (State.LATCHED, cause, True)
+
+
+def test_a_motion_whose_preparation_fails_leaves_no_memory_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def interrupted(*_: object, **_more: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    memory = SharedMemory.sealed(b"set-points")
+    task: Any = SimpleNamespace(close=memory.close)
+    monkeypatch.setattr(winch_runs, "ready_to_simulate", interrupted)
+    board, unused = SharedRequests(), SimpleNamespace()
+    opened: Any = (GACHON, task, unused, board, unused)
+    try:
+        with (
+            pytest.raises(KeyboardInterrupt),
+            winch_runs.open_mover(*opened, need_real_time_rights=False, listener=unused),
+        ):
+            pass
+    finally:
+        board.close()
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(memory.descriptor)

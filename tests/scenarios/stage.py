@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -118,10 +118,15 @@ class Stage:
         )
         return run_along_path(self.prepared, self._mover, recorder, before_motion=on_armed)
 
-    def _mover(self, motion: PathMotion) -> AbstractContextManager[MotionHere]:
-        drives = ReadyDrives(self.prepared.rig, self.group, None, self.rehearsal.carry, ())
+    @contextmanager
+    def _mover(self, motion: PathMotion) -> Iterator[MotionHere]:
+        rehearsal = self.rehearsal
+        drives = ReadyDrives(
+            self.prepared.rig, self.group, lambda: rehearsal.pose, rehearsal.carry, ()
+        )
         self.mover = MotionHere(motion, drives, self, self.board)
-        return nullcontext(self.mover)
+        with closing(motion):
+            yield self.mover
 
     def events(self) -> list[RunEvent]:
         return self.folder.events()

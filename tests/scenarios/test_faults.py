@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import can
 import numpy as np
@@ -27,7 +27,9 @@ from executor.trajectory.setpoints import PreparedRun, prepare
 from model.errors import Fault, Refused
 from model.files.drive_profile_file import ProfileDocument
 from model.files.rig_file import RigDocument
+from model.pose import Array
 from model.rig import rig_from_document
+from simulation.plant import Plant
 from tests.cli.plans import RIG
 from tests.cli.program import call
 from tests.drivers.test_drive_warnings import answers_after_its_set_points
@@ -346,6 +348,28 @@ def test_a_bus_that_fails_leaves_the_drives_stopping_on_their_own(
         summary = concluded(stage, outcome)
     assert summary["verdict"] == "FAILED"
     assert any("no buffer space" in reason for reason in summary["reasons"])
+
+
+def test_a_simulation_that_fails_is_the_cause_of_the_end(
+    prepared: PreparedRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The true pose after the motion, which then fails as well, is not needed."""
+
+    def fail(plant: Plant, unstrained: Array) -> NoReturn:
+        raise plant._lost("no equilibrium after 200 steps", unstrained)
+
+    def script(stage: Stage) -> None:
+        if stage.cycle == CRUISING:
+            monkeypatch.setattr(Plant, "settling", fail)
+
+    with staged(prepared, tmp_path / "run", script) as stage:
+        outcome = stage.run()
+        with pytest.raises(Fault, match="no equilibrium"):
+            assert stage.rehearsal.pose
+        (event,) = [event for event in stage.events() if event.code == "fault"]
+    assert outcome.state is State.LATCHED
+    cause = "the simulation failed: no equilibrium after 200 steps; quick stop of all drives"
+    assert outcome.cause == event.text == cause
 
 
 @pytest.mark.usefixtures("no_pictures")

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import signal
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 from drivers.can_bus import BusSettings, open_bus
 from drivers.factory import make_drive_group
-from executor.control.path_runs import run_along_path
+from executor.control.path_runs import PathMotion, run_along_path
 from executor.realtime.child import ReadyDrives
 from executor.realtime.process import MotionHere
 from executor.realtime.scheduling import RealClock, real_time
@@ -66,9 +67,15 @@ def _moved(
         group.configure()
         drives = ReadyDrives(rig, group, None, lambda _load: None, ())
         clock = RealClock(prepared.checked.table.cycle)
+
+        @contextmanager
+        def mover(motion: PathMotion) -> Iterator[MotionHere]:
+            with closing(motion):
+                yield MotionHere(motion, drives, clock, board)
+
         outcome = run_along_path(
             prepared,  # on a virtual bus: no latch, no reference
-            lambda motion: nullcontext(MotionHere(motion, drives, clock, board)),
+            mover,
             recorder,
             before_motion=lambda _denied: None,
         )
