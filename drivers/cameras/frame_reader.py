@@ -31,6 +31,7 @@ END_TIMEOUT, ROUND = 2.0, 0.1
 NOT_OPENED = "cannot be opened"
 NOT_ON_TIME = f"delivered no image on time for {FROZEN:g} s"
 TRUNCATED = f"delivered no complete image for {FROZEN:g} s"
+SAME = f"delivered the same image for {FROZEN:g} s"
 """Why a camera delivers no images, as a predicate."""
 
 
@@ -319,7 +320,8 @@ class FrameReader:
         """Puts each image of a camera until that is lost, or this closed."""
         number, failed = -1, 0
         copies, schedule, driver_times = CopyCheck(), ArrivalSchedule(), DriverTimes()
-        latest, is_used = self._clock() + FROZEN, False
+        used = complete = new = self._clock()  # when the last of each kind came
+        is_used = False
         self.lost = "" if capture.isOpened() else NOT_OPENED
         decoded = _decoded_jpeg if not self.lost and _delivers_jpeg(capture) else np.asarray
         while not (self.lost or self._is_closing):
@@ -335,14 +337,16 @@ class FrameReader:
             is_on_time = schedule.is_on_time(now) or time is not None or not self._needs_times
             image = decoded(picture)
             is_copy = image is not None and copies.is_copy(image)
+            complete = complete if image is None else now
+            new = new if image is None or is_copy else now
             self.truncated += is_used and image is None
             self.late += is_used and image is not None and not is_on_time
             if image is not None and is_on_time and not (is_copy and is_used):
-                is_used, latest = True, now + FROZEN
+                is_used, used = True, now
                 self._put(Arrived(number, now if time is None else time, image))
-            elif now > latest:
-                same = f"delivered the same image for {FROZEN:g} s"
-                self.lost = TRUNCATED if image is None else same if is_copy else NOT_ON_TIME
+            elif now > used + FROZEN:
+                self.lost = SAME if now > new + FROZEN else NOT_ON_TIME
+                self.lost = TRUNCATED if now > complete + FROZEN else self.lost
 
     def _put(self, arrived: Arrived) -> None:
         with self._changed:
@@ -366,13 +370,55 @@ def _delivers_jpeg(capture: cv2.VideoCapture) -> bool:
     )
 
 
+#: The decoder reads up to this many bytes ahead, and waits for them before the last block. Zeros
+#: are less than a block with the standard Huffman tables.
+AHEAD = 8
+#: Markers of JPEG files: the first of those that restart the decoder, and their number, after which
+#: they begin again; a sequential Huffman-coded image; a scan. Source: ITU-T T.81, table B.1.
+_RESTART, _RESTARTS, _SEQUENTIAL, _SCAN = 0xD0, 8, (0xC0, 0xC1), 0xDA
+
+
 def _decoded_jpeg(data: NDArray[np.generic]) -> NDArray[np.generic] | None:
-    """The grey image in the data of a JPEG file; None if it is truncated."""
+    """The grey image in the data of a JPEG file; None if it is truncated.
+
+    At the marker that ends an image, the decoder completes one of which bytes are missing, and
+    prints a warning. Without that marker, which some cameras omit, it runs out of data. It needs
+    the marker for an image of several scans, such as a progressive one.
+    """
+    file = np.asarray(data, np.uint8).ravel()
+    begin = _single_scan(file)
+    if begin:
+        found = begin + np.flatnonzero(file[begin:-1] == 0xFF)
+        kinds = file[found + 1]
+        restarts = (kinds >= _RESTART) & (kinds < _RESTART + _RESTARTS)
+        ends = found[(kinds != 0) & (kinds != 0xFF) & ~restarts]  # 0: a byte of data
+        end = ends[0] if ends.size else len(file)
+        order = kinds[restarts & (found < end)]
+        if not np.array_equal(order, _RESTART + np.arange(len(order)) % _RESTARTS):
+            return None
+        file = np.concatenate([file[:end], np.zeros(AHEAD, np.uint8)])
     try:
         flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-        return cv2.imdecode(np.asarray(data, np.uint8), flags)
+        return cv2.imdecode(file, flags)
     except cv2.error:  # no data, or a size beyond its limit
         return None
+
+
+def _single_scan(file: NDArray[np.uint8]) -> int:
+    """Where the scan of a sequential JPEG file begins; 0 if it has several, or is another file."""
+    at, components = 2, 0
+    while at + 10 <= len(file) and file[at] == 0xFF:
+        marker = file[at + 1]
+        if marker == 0xFF:  # fills up
+            at += 1
+            continue
+        after = at + 2 + int.from_bytes(file[at + 2 : at + 4].tobytes())
+        if marker in _SEQUENTIAL:
+            components = file[at + 9]
+        if marker == _SCAN:
+            return after if file[at + 4] == components else 0
+        at = after
+    return 0
 
 
 def _stated_time(capture: cv2.VideoCapture) -> float:

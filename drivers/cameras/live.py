@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from drivers.cameras.frame_reader import (
     NOT_ON_TIME,
     NOT_OPENED,
+    SAME,
     TRUNCATED,
     FrameReader,
     silent_opencv,
@@ -209,7 +210,7 @@ class LiveCamera(FrameSource):
         needs_times: bool = True,
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
-        self._stopped, self._seen, self._camera = stopped, False, camera
+        self._stopped, self._seen, self._camera = stopped, 0, camera
         self._is_address = "://" in str(source)
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
@@ -251,14 +252,14 @@ class LiveCamera(FrameSource):
         """
         arrived = self._reader.newest(self._stopped)
         if arrived is not None:
-            self._seen = True
+            self._seen += 1
             number, image = arrived.number, _grey(arrived.picture)
             refuse_wrong_size(image, self._camera, self.name)
             return Frame(arrived.time - self._camera.latency, image, f"image {number}", number)
         if self._stopped():
             what = "stopped before the camera delivered an image"
             raise StoppedByOperator(what, where=self.name)
-        why, next_step = _likely_cause(self._reader.lost, self._is_address)
+        why, next_step = _likely_cause(self._reader.lost, self._is_address, self._seen)
         kind = Fault if self._seen else HardwareMissing
         what = f"the camera {self._reader.lost or 'delivers no more images'}"
         raise kind(what, where=self.name, why=why, next_step=next_step)
@@ -278,8 +279,14 @@ class LiveCamera(FrameSource):
         self._finalizer()
 
 
-def _likely_cause(lost: str, is_address: bool) -> tuple[str, str]:
-    """Why a camera may deliver no images, and the next step; ``lost`` as `FrameReader` has it."""
+def _likely_cause(lost: str, is_address: bool, seen: int) -> tuple[str, str]:
+    """Why a camera may deliver no images, and the next step.
+
+    Args:
+        lost: As `FrameReader` has it.
+        is_address: It is a network camera.
+        seen: Number of images that were used.
+    """
     if lost == NOT_ON_TIME:
         return (
             "its images come too unevenly for their times to be known",
@@ -297,9 +304,21 @@ def _likely_cause(lost: str, is_address: bool) -> tuple[str, str]:
             "open the address on this computer (http:// in a browser, rtsp:// in a player such as"
             " VLC) and correct it, or set the camera to MJPEG or H.264",
         )
+    if lost == SAME:
+        return (
+            "it or its driver hangs, or its lens is covered",
+            "check its lens, and switch it off and on, then start again",
+        )
+    if is_address and seen <= 1:
+        return (
+            "the address is that of a single image, not of a video, the camera hangs or was"
+            " switched off, or the network is interrupted",
+            "take the address of the video from the camera's manual, and check its power and"
+            " network",
+        )
     if is_address:
         return (
-            "it hangs or was switched off, the network is interrupted, or its lens is covered",
+            "it hangs or was switched off, or the network is interrupted",
             "check its power and network, and open the address on this computer (http:// in a"
             " browser, rtsp:// in a player such as VLC), then start again",
         )
@@ -309,7 +328,7 @@ def _likely_cause(lost: str, is_address: bool) -> tuple[str, str]:
             "check the cable and `ls -l /dev/video*`, close other programs, or name another camera",
         )
     return (
-        "it was unplugged or hangs, its USB bus is too slow, or its lens is covered",
+        "it was unplugged or hangs, or its USB bus is too slow",
         "check the cable, then start again",
     )
 

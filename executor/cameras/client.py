@@ -80,7 +80,7 @@ class CameraClient:
         """Why there will be no more samples; None while there may be."""
         self.dropped = 0
         """Number of images due while it was busy."""
-        self._poses = 0
+        self._poses = self._late = self._truncated = 0
         self._process = process
         self._health, self._pace = CameraHealth(), FrameRate()
 
@@ -127,6 +127,19 @@ class CameraClient:
             return f"failed ({self.failed.what})"
         return self._health.trouble(now)
 
+    @property
+    def skipped(self) -> str:
+        """How many images were skipped, and why, as a sentence; empty if none was."""
+        if not self.dropped:
+            return ""
+        text = (
+            f"camera {self.name}: {self.dropped} of {self.dropped + len(self.samples)} images"
+            " skipped; the previous one had not arrived yet, or was still being measured"
+        )
+        unused = {"truncated": self._truncated, "late": self._late}
+        numbers = ", ".join(f"{count} {what}" for what, count in unused.items() if count)
+        return text + (f"; images delivered but not used: {numbers}" if numbers else "")
+
     def record(self) -> CameraRecord:
         """Statistics of its images."""
         return CameraRecord(
@@ -170,6 +183,7 @@ class CameraClient:
             self._pace.take(sample.found.time, sample.seconds)
             self._health.answer(seen)
             self._poses += seen
+            self._late, self._truncated = sample.late, sample.truncated
         return sample
 
     def _try(self, act: Callable[[], None]) -> None:

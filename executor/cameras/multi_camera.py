@@ -170,11 +170,13 @@ class CameraRecords:
         together: Fused samples, one per frame, in order of time.
         alone: Samples of each camera by its name, if there are several.
         cameras: Statistics of each camera.
+        skipped: Which cameras skipped images, and why, as sentences.
     """
 
     together: Sequence[CameraSample] = ()
     alone: Mapping[str, Sequence[CameraSample]] = field(default_factory=dict)
     cameras: tuple[CameraRecord, ...] = ()
+    skipped: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -282,6 +284,7 @@ class RunCameras:
             tuple(sorted(self._together, key=lambda sample: sample.found.time)),
             {client.name: tuple(client.samples) for client in self._clients} if several else {},
             tuple(client.record() for client in self._clients),
+            tuple(client.skipped for client in self._clients if client.skipped),
         )
 
     def _wait_for_all(self, stopped: Callable[[], bool]) -> None:
@@ -424,12 +427,8 @@ class CameraWatch:
         with self._listener.waiting("waiting for the last images"):
             seen = self._cameras.finish(self._must_hurry)
         self._report_news(at)
-        for camera in seen.cameras:
-            if camera.dropped:
-                what = f"{camera.dropped} of {camera.dropped + camera.pictures} images skipped"
-                why = "the previous one had not arrived yet, or was still being measured"
-                text = f"camera {camera.name}: {what}; {why}"
-                self._report("pictures_dropped", text, at)
+        for text in seen.skipped:
+            self._report("pictures_dropped", text, at)
         return seen
 
     def _stop(self, label: str, detail: str, code: str, why: str) -> None:

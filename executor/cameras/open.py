@@ -189,6 +189,11 @@ class RenderedImages:
         after, second = self._poses[1]
         return interpolate(first, second, (time - before) / (after - before))
 
+    @property
+    def unused(self) -> tuple[int, int]:
+        """None: each comes in time and whole."""
+        return 0, 0
+
     def close(self) -> None:
         """Nothing to close."""
 
@@ -203,6 +208,11 @@ class LiveImages:
         """The next image, and the middle of its exposure after the request, [s]."""
         frame = self._camera.read()
         return frame.image, frame.time - trigger.asked
+
+    @property
+    def unused(self) -> tuple[int, int]:
+        """Numbers of images not used so far, as they came late, or were truncated."""
+        return self._camera.late, self._camera.truncated
 
     def close(self) -> None:
         """Closes the camera."""

@@ -60,6 +60,8 @@ class CameraSample:
         picture: Name of the image kept in the run folder, or empty.
         seconds: Processing time, [s]; NaN if nothing was measured.
         clearance: Distances at the measured pose, or None.
+        late, truncated: Numbers of images that were delivered so far but not used, as they came
+            late or were truncated.
     """
 
     frame: int
@@ -67,6 +69,8 @@ class CameraSample:
     picture: str = ""
     seconds: float = float("nan")
     clearance: MeasuredClearance | None = None
+    late: int = 0
+    truncated: int = 0
 
 
 def sample_without_pose(frame: int, time: float, reason: str) -> CameraSample:
@@ -79,6 +83,10 @@ class ImageSource(Protocol):
 
     def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """A grey image, and the middle of its exposure after the request, [s]."""
+
+    @property
+    def unused(self) -> tuple[int, int]:
+        """Numbers of images not used so far, as they came late, or were truncated."""
 
     def close(self) -> None:
         """Closes the camera."""
@@ -151,7 +159,8 @@ class CameraWorker:
         began = time.monotonic()
         found = self._tracker.observe(image, taken, encoder_pose)
         self._newest = trigger.frame, image, found
-        return CameraSample(trigger.frame, found, name, time.monotonic() - began)
+        seconds, (late, truncated) = time.monotonic() - began, self._source.unused
+        return CameraSample(trigger.frame, found, name, seconds, late=late, truncated=truncated)
 
     def show(self) -> None:
         """Shows the newest image to viewers; called after its answer was sent."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -11,6 +12,7 @@ import pytest
 
 from executor.cameras.client import CameraClient
 from executor.cameras.multi_camera import CameraRecords, CameraWatch, RunCameras
+from executor.cameras.process import CameraSample
 from executor.supervision import Callbacks, GuardedListener, LocalRequests, StopReason
 from model.progress import Listener
 from tests.executor.test_run_cameras import MODEL, RATE, Scripted
@@ -58,6 +60,54 @@ def test_too_little_clearance_stops_the_run(names: list[str], who: str) -> None:
     assert reason.text.startswith(f"{who} measured less clearance than the scene requires: ")
     board, _ = watched(4, 10.0, *(Scripted(name, [0]) for name in names), clearance_stop=False)
     assert not board.read().stop
+
+
+class Unreliable(Scripted):
+    """A camera that also delivers late and truncated images."""
+
+    late, truncated = 0, 0
+
+    def answer_within(self, patience: float) -> CameraSample | None:
+        sample = super().answer_within(patience)
+        if sample is None:
+            return None
+        return replace(sample, late=self.late, truncated=self.truncated)
+
+
+@pytest.mark.parametrize(
+    ("late", "truncated", "words"),
+    [
+        (0, 0, ""),
+        (0, 38, "; images delivered but not used: 38 truncated"),
+        (2, 1, "; images delivered but not used: 1 truncated, 2 late"),
+    ],
+)
+def test_skipped_images_are_reported_with_those_that_were_not_used(
+    late: int, truncated: int, words: str
+) -> None:
+    camera, reported = Unreliable("front", [1]), list[tuple[str, str]]()
+    camera.late, camera.truncated = late, truncated
+    status: Any = SimpleNamespace(
+        take_cameras=lambda _cameras: None, take_measured=lambda *_measured: None
+    )
+    cameras = RunCameras([CameraClient(camera, "here")], MODEL, 0.0, RATE)
+    watch = CameraWatch(
+        cameras,
+        status,
+        LocalRequests(),
+        lambda code, text, _at: reported.append((code, text)),
+        clearance_stop=False,
+    )
+    for k in range(6):
+        watch.trigger(k / RATE, k / RATE, None, None)
+    watch.finish(1.0)
+    assert reported == [
+        (
+            "pictures_dropped",
+            "camera front: 3 of 6 images skipped; the previous one had not arrived yet, or was"
+            f" still being measured{words}",
+        )
+    ]
 
 
 @pytest.mark.parametrize(

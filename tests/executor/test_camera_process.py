@@ -48,7 +48,9 @@ def test_it_ends_without_a_word_when_its_parent_is_gone(make: Any, closed: str) 
 
 
 class Dark:
-    """A camera without light."""
+    """A camera without light, which also delivered images that were not used."""
+
+    unused = 2, 5
 
     def image(self, _trigger: FrameRequest) -> tuple[np.ndarray, float]:
         return np.zeros((4, 4), np.uint8), 0.0
@@ -97,7 +99,17 @@ def test_a_synthetic_image_shows_the_platform_of_its_latency_ago() -> None:
 
 def test_a_live_image_may_be_exposed_before_it_is_requested() -> None:
     camera: Any = SimpleNamespace(
-        read=lambda: Frame(12.26, np.zeros((4, 4), np.uint8), "x"), close=lambda: None
+        read=lambda: Frame(12.26, np.zeros((4, 4), np.uint8), "x"), late=3, truncated=1
     )
-    _, delay = LiveImages(camera).image(FrameRequest(0, 1.0, 12.3, None, None))
+    source = LiveImages(camera)
+    _, delay = source.image(FrameRequest(0, 1.0, 12.3, None, None))
     assert delay == pytest.approx(-0.04)
+    assert source.unused == (3, 1)
+
+
+def test_a_sample_states_how_many_images_were_not_used() -> None:
+    tracker: Any = SimpleNamespace(observe=lambda *_: NoPose(0.0, "dark"))
+    worker = CameraWorker(_RIG, _RIG.cameras[0], Dark(), None, 1, named=False)
+    worker._tracker = tracker
+    sample = worker.measure(FrameRequest(0, 0.0, 0.0, None))
+    assert (sample.late, sample.truncated) == Dark.unused

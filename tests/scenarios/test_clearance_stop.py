@@ -151,6 +151,8 @@ def test_the_loop_tells_what_the_stop_was_for(
 class Rendered:
     """Images of the platform at the pose of the request."""
 
+    unused = 0, 0
+
     def __init__(self, camera: SyntheticCamera) -> None:
         self._camera = camera
 

@@ -233,6 +233,7 @@ def test_a_camera_that_repeats_one_picture_for_long_is_lost(
         with pytest.raises(Fault, match=f"the same image for {FROZEN:g} s") as caught:
             live.read()
     assert caught.value.where == f"camera {camera.name} (7)"
+    assert "lens" in caught.value.why
     assert queue.released
 
 
@@ -243,6 +244,7 @@ def test_a_lost_camera_is_reported_by_its_name_and_source(queue: Queue, camera: 
         with pytest.raises(Fault, match=f"{LOST_IMAGES} times in a row") as caught:
             live.read()
     assert caught.value.where == f"camera {camera.name} (7)"
+    assert "lens" not in caught.value.why
 
 
 def test_a_camera_without_images_or_of_another_size_is_released(
