@@ -13,6 +13,7 @@ from can.interfaces.socketcan import SocketcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus
 
+from drivers.setup_refusals import SETTING_UP
 from model.errors import Fault, HardwareMissing, Refused
 
 
@@ -94,6 +95,15 @@ class ForeignMaster(BusFault):
     code = "foreign_master"
     cause = "two masters must not command the same drives"
     remedy = "end the other program, or wait for its run to finish"
+
+
+class OtherMaster(Refused):
+    """Another program commanded CiA 402 drives while they were read or configured."""
+
+    def __init__(self, what: str) -> None:
+        """Takes its command; no ``node`` in the values, so that the set-up ends at once."""
+        why, step = ForeignMaster.cause, ForeignMaster.remedy
+        super().__init__(what, where=SETTING_UP, why=why, next_step=step)
 
 
 @contextmanager

@@ -138,7 +138,7 @@ class RobotReport:
         at: ISO time of these values if nothing watches the drives; None while a run reports.
         why_not: Why some of it is unknown, or older than the last attempt to read it.
         why_lost: Why the drives, as read, must be homed.
-        is_unread: The last reading failed: whether the reference is valid is unknown.
+        is_unread: None yet, or the last one failed: whether the reference is valid is unknown.
         in_use: Another program commanded or used the drives at the last reading; see ``why_not``.
     """
 

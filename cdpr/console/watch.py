@@ -17,7 +17,7 @@ from datetime import datetime
 from typing import Any
 
 from cdpr.console.view import RobotReport, RobotView, commanded_pose
-from drivers.can_errors import ForeignMaster
+from drivers.can_errors import ForeignMaster, OtherMaster
 from executor.cameras.live_image import ImageReader, LiveImage
 from executor.drives import is_simulated
 from executor.remote.client import Answer, RunLink, cable_tension
@@ -238,7 +238,8 @@ class RobotWatch:
         self._lock = threading.Lock()
         self._answer: Future[StatusResult] | None = None
         self._due = 0.0  # when to read the drives, on the monotonic clock; at the start
-        self.now = RobotReport(None, None, why_not="the drives have not been read yet")
+        why_not = "the drives have not been read yet"
+        self.now = RobotReport(None, None, why_not=why_not, is_unread=True)
 
     def simulate_at(self, pose: Pose) -> None:
         """Places the robot where simulated drives start."""
@@ -328,13 +329,14 @@ class RobotWatch:
                 why_not=why,
                 why_lost=self.now.why_lost,
                 is_unread=True,
-                in_use=isinstance(error, ForeignMaster),
+                in_use=isinstance(error, (ForeignMaster, OtherMaster)),
             )
         else:
             if result.drives is None:
                 self._due = time.monotonic() + USED_FOR
                 used = "another program uses the drives"
-                seen = replace(self.now, why_not=used, in_use=True)
+                at = _local_time() if self.now.tensions is None else self.now.at
+                seen = replace(self.now, at=at, why_not=used, in_use=True)
             else:
                 robot, reference = self._view.at_rest(result), result.reference
                 why_not = result.why_no_pose or reference.why_not

@@ -358,6 +358,10 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
     read-only   if it holds the value     if it holds the value, or as absent  yes
     not now     if it holds the value     if it holds the value                no
     another     no                        if it holds the value, or as absent  no
+    none        no                        no                                   no
+
+    An object counts as absent if it cannot be read or ``instead`` states the consequence. Without a
+    code a drive restarted, or another program commands or answers.
     """
     client = network.client(node)
     if setting.per_mille_of is not None:
@@ -367,7 +371,9 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
     try:
         client.write(setting.index, setting.sub, setting.data(), setting.name)
     except Refused as error:
-        code = error.values.get("abort_code")
+        if "abort_code" not in error.values:
+            raise
+        code = error.values["abort_code"]
         if code in OUT_OF_RANGE and setting.equivalent and setting.value != setting.equivalent[0]:
             return _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
         if setting.transient and code in READ_ONLY:
@@ -382,7 +388,7 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
             raise
         if setting.instead:
             lost = "there is no" if code in OBJECT_DOES_NOT_EXIST else "the drive refuses"
-            reason = "" if code in OBJECT_DOES_NOT_EXIST else f" ({abort_text(int(code or 0))})"
+            reason = "" if code in OBJECT_DOES_NOT_EXIST else f" ({abort_text(int(code))})"
             remarks.append(f"{lost} {setting}{reason}: {setting.instead}")
         return
     if setting.transient:
@@ -397,7 +403,9 @@ def _fixed_value(network: SetupNetwork, node: int, setting: Setting) -> bytes | 
     """Value of an object that cannot be written; None if it cannot be read either."""
     try:
         return network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused:
+    except Refused as error:
+        if "abort_code" not in error.values:
+            raise
         return None
 
 

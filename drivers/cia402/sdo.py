@@ -18,7 +18,7 @@ from math import ceil
 import can
 
 from drivers.can_bus import SentFrame, echoes_own_frames, receive_frame, transmit
-from drivers.can_errors import EchoFilter, ForeignMaster, error_frame_fault
+from drivers.can_errors import EchoFilter, OtherMaster, error_frame_fault
 from drivers.cia402.error_codes import abort_text
 from drivers.cia402.pdo import (
     EMCY_BASE,
@@ -37,7 +37,7 @@ from drivers.cia402.pdo import (
 from drivers.cia402.sdo_jobs import SdoRequest, parse_value
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import Pump
-from drivers.setup_refusals import SETTING_UP, DriveRestarted
+from drivers.setup_refusals import DriveRestarted
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
 RESPONSE_TIMEOUT = 2.0
@@ -225,12 +225,7 @@ class SetupNetwork:
 
     def _refuse_foreign(self, message: can.Message) -> None:
         if self._own.is_foreign(message.arbitration_id):
-            raise Refused(
-                foreign_master_message(message.arbitration_id, message.data),
-                where=SETTING_UP,
-                why=ForeignMaster.cause,
-                next_step=ForeignMaster.remedy,
-            )
+            raise OtherMaster(foreign_master_message(message.arbitration_id, message.data))
 
 
 class Client:

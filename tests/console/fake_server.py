@@ -140,6 +140,7 @@ class Fake:
         self.plan: str | None = None
         self.compared: str | None = None
         self.refusal = ""  # of every command of the page in control
+        self.stop_refusal = ""  # of STOP, though a motion here stops
         self.poses: list[dict[str, Any]] = []
         self.outcome: dict[str, Any] | None = None
         self.share = self.rate = 0.0
@@ -441,6 +442,8 @@ class Fake:
         self.held = None
         if self.moving:
             self.wished = {**self.wished, "stop": True}
+        if self.stop_refusal:
+            return False, self.stop_refusal
         active = self.moving is not None or self.jog_ready or self.cable_ready
         return active, "" if active else "nothing moves"
 

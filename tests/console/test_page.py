@@ -156,6 +156,28 @@ def test_a_stop_without_an_answer_says_so(desk: Visit) -> None:
     expect(desk.page.locator("#stop-answer")).to_contain_text("No answer to STOP for 1 s")
 
 
+def test_an_answer_that_stop_failed_stays_while_the_own_run_stops(desk: Visit) -> None:
+    """It was overwritten by the next state: another robot's run of this user does not answer."""
+    desk.take_control()
+    desk.load()
+    desk.run()
+    answer, words = desk.page.locator("#stop-answer"), "a run does not answer"
+    desk.fake.ask(set={"stop_refusal": words})
+    desk.fake.let_pass(desk.page, 12)  # at full speed it takes some states to stop
+    desk.page.keyboard.press(" ")
+    expect(desk.page.locator("#motion-text")).to_have_text("At rest")
+    desk.fake.let_pass(desk.page)
+    expect(answer).to_have_text(words)
+    expect(answer).to_have_class("failed")
+    desk.fake.ask(set={"stop_refusal": ""})
+    desk.run()
+    expect(answer).to_have_text("")
+    desk.fake.let_pass(desk.page, 12)
+    desk.page.keyboard.press(" ")
+    expect(answer).to_have_text("Stopping along the path")
+    expect(answer).not_to_have_class("failed")
+
+
 def test_stop_answers_an_open_question_with_no(desk: Visit) -> None:
     desk.take_control()
     desk.load()

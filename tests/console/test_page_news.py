@@ -154,9 +154,15 @@ def test_a_robot_on_a_bus_is_not_said_to_rest_while_another_program_uses_it(desk
     answer = desk.page.locator("#stop-answer")
     expect(answer).to_have_class("failed")
     unread = {"counts": False, "known": False, "why_not": words}
-    desk.fake.ask(state={"simulated": False, "drives_read": read, "reference": unread})
+    state = {"simulated": False, "drives_read": read, "reference": unread}
+    desk.fake.ask(state=state)  # which is read again every second
     expect(desk.page.locator("#motion-text")).to_have_text("Used by another program")
     expect(desk.page.locator("#progress-text")).to_have_text(f"As last read, {words}.")
+    desk.fake.ask(state={**state, "tensions_n": None})
+    at = re.compile(r"^Used by another program at 2 Jan \d\d:04:05$")
+    expect(desk.page.locator("#motion-text")).to_have_text(at)
+    at = re.compile(rf"^As last read at 2 Jan \d\d:04:05, {words}\.$")
+    expect(desk.page.locator("#progress-text")).to_have_text(at)
     expect(desk.page.locator("#lamp-homed")).to_have_text("Homed: unknown")
     expect(desk.page.locator("#homed-text")).to_have_text(f"Homed: unknown: {words}.")
     desk.page.clock.run_for(7000)

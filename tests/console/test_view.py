@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import can
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -30,6 +31,7 @@ from cdpr.console.view import (
 )
 from cdpr.console.watch import USED_FOR, RobotWatch
 from drivers.can_errors import ForeignMaster
+from drivers.factory import read_drives
 from executor.drives import DriveStatus
 from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import RunFolder
@@ -47,6 +49,7 @@ from model.scene import load_scene
 from model.statics.gravity import working_tensions
 from model.winches import WinchMap
 from tests.cli.plans import CONFIGS, HALL, RIG, write_short_plan
+from tests.drivers.odrive_bench import ODRIVE_RIG
 from tracking.clearance import clearance_at
 from tracking.measurement import PoseMeasurement
 
@@ -295,21 +298,64 @@ def test_a_reading_that_fails_does_not_undo_the_loss_of_a_reference() -> None:
     assert stored_state(StoredState(None, True, None), drives.watch.now)["reference"] == lost
 
 
-def test_drives_that_another_program_commands_are_reported_as_in_use() -> None:
+class CommandedBus:
+    """No drive answers; a set-point of another program comes."""
+
+    channel_info = "commanded"
+
+    def __init__(self, identifier: int) -> None:
+        point = can.Message(arbitration_id=identifier, data=bytes(8), is_extended_id=False)
+        self.coming = [None, point]  # what came before is discarded
+
+    def fileno(self) -> int:
+        raise NotImplementedError
+
+    def send(self, message: can.Message, timeout: float | None = None) -> None: ...
+
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        return self.coming.pop(0) if self.coming else None
+
+
+@pytest.mark.parametrize(
+    ("file", "identifier", "words"),
+    [
+        (RIG, 0x201, "another program sends set-points to drive 1"),
+        (ODRIVE_RIG, 0x2C, "another program commands drive 1 (Set_Input_Pos)"),
+    ],
+)
+def test_drives_that_another_program_commands_are_reported_as_in_use(
+    file: Path, identifier: int, words: str
+) -> None:
     """The page said "At rest" while it showed the other program's set-points."""
-    drives = Drives()
-    words = "another program sends set-points to drive 1"
-    drives.reading = replace(RELEASED, drives=None, missing=ForeignMaster(words, "bus"))
+    rig, drives = load_rig(file).with_bus("socketcan", "can0"), Drives()
+    with pytest.raises((Refused, ForeignMaster)) as caught:
+        read_drives(rig, CommandedBus(identifier), partial=True)  # type: ignore[arg-type]
+    drives.reading = replace(RELEASED, drives=None, missing=caught.value)
     drives.rest()
     read = drives.watch.now.as_dict()
     assert read is not None
     assert (read["why_not"], read["in_use"]) == (words, True)
-    assert words in none_found(THE_RIG.with_bus("socketcan", "can0"), drives.watch.now)
+    assert words in none_found(rig, drives.watch.now)
     assert none_found(THE_RIG, RobotReport(None, None)) == "nothing moves"
     drives.reading = SILENT
     drives.watch.ask()
     drives.rest()
     assert not drives.watch.now.in_use
+
+
+def test_whether_drives_are_homed_is_unknown_before_their_first_reading() -> None:
+    """The page showed a green "Homed" until then, as long as another program used them."""
+    drives, valid = Drives(), StoredState(None, True, None)
+    unread = stored_state(valid, drives.watch.now)["reference"]
+    why = "the drives have not been read yet"
+    assert unread == {"counts": False, "known": False, "why_not": why}
+    drives.reading = replace(RELEASED, drives=None, being_set_up=True)
+    drives.rest()
+    assert drives.watch.now.in_use
+    assert not stored_state(valid, drives.watch.now)["reference"]["known"]
+    assert drives.watch.now.at is not None, "of this reading, as there are no values"
+    drives.watch.simulate_at(THE_RIG.home)
+    assert stored_state(valid, drives.watch.now)["reference"]["counts"]
 
 
 def test_a_run_whose_cables_fit_no_pose_keeps_no_old_one() -> None:

@@ -64,15 +64,20 @@ def _simulated_time(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(examine, "SetupNetwork", Timed)
 
 
-def set_up(rig: Rig, bus: ScriptedBus, *, to_reset: bool = False) -> tuple[str, ...]:
-    ignored: Callable[[tuple[int, ...]], None] = lambda _nodes: None  # noqa: E731
+def set_up(
+    rig: Rig,
+    bus: ScriptedBus,
+    *,
+    to_reset: bool = False,
+    on_restarted: Callable[[tuple[int, ...]], None] = lambda _nodes: None,
+) -> tuple[str, ...]:
     return configure_drives(
         rig,
-        bus,
+        bus,  # type: ignore[arg-type]
         None,
         max_tension=None,
         to_reset=to_reset,
-        on_restarted=ignored,  # type: ignore[arg-type]
+        on_restarted=on_restarted,
     ).remarks
 
 
@@ -1441,6 +1446,51 @@ def test_every_profile_names_its_sources() -> None:
     for name in profile_names():
         assert load_profile(name).sources, name
     assert issubclass(InvalidFile, CdprError)
+
+
+class Interrupted(ScriptedBus):
+    """Another frame comes before the answer to one of drive 1's writes; a boot-up is drive 8's."""
+
+    def __init__(self, before: ScriptedBus, profile: str, number: int, frame: can.Message) -> None:
+        super().__init__(ScriptedDrive(node, eds_of(profile)) for node in before.drives)
+        self.profile, self.left, self.frame = profile, number, frame
+        for node, drive in self.drives.items():
+            drive.values = dict(before.drives[node].values)
+
+    def send(self, message: can.Message) -> None:
+        if message.arbitration_id == 0x601 and message.data[0] & 0xE0 == 0x20:
+            self.left -= 1
+            if self.left == 0:
+                self._receive(0.0005, self.frame.arbitration_id, bytes(self.frame.data))
+                if self.frame.arbitration_id == 0x708:
+                    self.drives[8] = ScriptedDrive(8, eds_of(self.profile))
+        super().send(message)
+
+
+@pytest.mark.parametrize(
+    ("profile", "frame", "words"),
+    [
+        ("elmo-gold", "708#00", "drive 8 restarted during set-up"),
+        ("epos4", "202#0F0000000000", "another program sends set-points to drive 2"),
+    ],
+)
+def test_a_restart_or_another_master_is_refused_at_every_write(
+    rig: Rig, profile: str, frame: str, words: str
+) -> None:
+    """During the write of an optional object it passed for one that cannot be written."""
+    identifier, data = frame.split("#")
+    sent = can.Message(arbitration_id=int(identifier, 16), data=bytes.fromhex(data))
+    theirs, bus = with_profile(rig, profile), eight_of(profile)
+    for _ in range(2):
+        bus.sent.clear()
+        set_up(theirs, bus)
+    writes = [m for m in downloads(bus) if m.arbitration_id == 0x601]
+    for number, write in enumerate(writes, 1):
+        reported: list[tuple[int, ...]] = []
+        with pytest.raises(Refused) as caught:
+            set_up(theirs, Interrupted(bus, profile, number, sent), on_restarted=reported.append)
+        assert caught.value.what == words, write
+        assert reported == ([(), (8,)] if identifier == "708" else [()]), write
 
 
 class HoldingDrive(ScriptedDrive):

@@ -37,6 +37,11 @@ function readText({ drives_read: read, tensions_n: tensions }) {
   return `${read.at && tensions ? `Read at ${dateAndTime(read.at).join(" ").trim()}, not watched.` : ""}${why}`.trim();
 }
 
+/** When another program was found to command the drives, if they are not read again since. */
+function foundText({ drives_read: read, tensions_n: tensions }) {
+  return read.at && !tensions ? ` at ${dateAndTime(read.at).join(" ").trim()}` : "";
+}
+
 /** More than two cables in the same trouble are counted: a list would be longer than its space. */
 function troubleText(tensions, [low, high]) {
   const words = (name, limit, values) => {
@@ -61,7 +66,7 @@ export function motionText(state) {
   }
   if (busy) return BEFORE[busy.verb] ?? busy.verb;
   if (isMovedByAnother(state)) return "Moved by another user";
-  if (read?.in_use) return "Used by another program";
+  if (read?.in_use) return `Used by another program${foundText(state)}`;
   return latched === null ? "At rest" : "Fault latched";
 }
 
@@ -70,7 +75,7 @@ export function restText(state) {
   const { busy, simulated, drives_read: read } = state;
   if (busy) return "";
   if (isMovedByAnother(state)) return `Process ${state.moved_by} of another user is not stopped from here.`;
-  if (read?.in_use) return `As last read, ${read.why_not}.`;
+  if (read?.in_use) return `As last read${foundText(state)}, ${read.why_not}.`;
   return simulated ? "Nothing is moving." : "No motion of this user is in progress.";
 }
 

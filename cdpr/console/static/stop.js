@@ -69,16 +69,16 @@ export function bindStop(connection, pressed, atRest) {
     if (event.key === "Enter" && event.target instanceof HTMLInputElement && ["checkbox", "radio"].includes(event.target.type)) event.target.click();
   });
   return {
-    /** Shows the run's response; a run that begins supersedes an answer that found none. */
+    /** Shows the run's response, unless STOP failed; a run that begins supersedes any answer. */
     show: (motion) => {
       const begins = isActive(motion) && !moved;
       moved = isActive(motion);
       const asked = motion?.wished.stop && !["finished", "stopped", "latched"].includes(motion.state);
       button.classList.toggle("asked", Boolean(asked));
       if (button.classList.contains("pressed")) return;
-      if (asked) write(answer, STOPPING);
+      if (begins) answer.classList.remove("failed");
+      if (asked && !answer.classList.contains("failed")) write(answer, STOPPING);
       else if (begins || answer.textContent === STOPPING) write(answer, "");
-      if (asked || begins) answer.classList.remove("failed");
     },
   };
 }
