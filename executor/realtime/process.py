@@ -94,13 +94,15 @@ class MotionHere:
 
     def arm(self, records: Records) -> Armed:
         """See `Mover`."""
+        # Not of `self`, which would keep the memory of the motion until a cycle is collected.
+        motion, drives = self._motion, self._drives
 
         def on_cycle(record: CycleRecord) -> None:
-            records.take_cycle(record, self._motion.after(record, self._drives))
+            records.take_cycle(record, motion.after(record, drives))
 
         calls = SupervisorCalls(self._board.read, on_cycle, records.take_event)
-        self._loop = self._motion.loop(self._drives, self._master, calls)
-        self._loop.arm(partial(self._motion.require, self._drives))
+        self._loop = motion.loop(drives, self._master, calls)
+        self._loop.arm(partial(motion.require, drives))
         if self._board.read().stop:
             raise StoppedByOperator("stopped before anything moved", next_step=self._after_stop)
         return Armed("", self._loop.positions)

@@ -276,6 +276,9 @@ class FakeCapture:
     def getBackendName(self) -> str:  # noqa: N802
         return "FFMPEG"
 
+    def get(self, _property: int) -> float:
+        return 0.0
+
     def read(self) -> tuple[bool, np.ndarray]:
         return True, np.zeros(self.size, dtype=np.uint8)
 
