@@ -13,6 +13,24 @@ from model.errors import Refused
 SETTING_UP = "configuring the drives"
 
 
+class SdoAborted(Refused):
+    """A drive aborted the transfer of an object: no other refusal says anything about an object.
+
+    Attributes:
+        abort_code: Source: CiA 301, 7.2.4.3.17.
+    """
+
+    def __init__(self, node: int, target: str, abort_code: int, text: str) -> None:
+        super().__init__(
+            f"the drive refused: {text}",
+            where=f"drive {node}, object {target}",
+            next_step="compare the object with the drive's manual and its EDS file;"
+            " `cdpr doctor RIG --drives` lists all objects of all drives",
+            values={"node": node, "object": target, "abort_code": abort_code},
+        )
+        self.abort_code = abort_code
+
+
 class DriveRestarted(Refused):
     """A drive restarted while it was configured.
 

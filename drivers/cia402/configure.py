@@ -50,8 +50,13 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import HOLDS
 from drivers.drive_group import OnRestarted, Pump
 from drivers.plausibility import require_within_limits
-from drivers.setup_refusals import DriveRestarted, Refusals, TorqueLost, answers_twice
-from model.errors import Refused
+from drivers.setup_refusals import (
+    DriveRestarted,
+    Refusals,
+    SdoAborted,
+    TorqueLost,
+    answers_twice,
+)
 from model.files.drive_profile_file import ProfileDocument
 from model.rig import Rig
 from model.winches import WinchMap
@@ -352,16 +357,14 @@ def _uncross_limits(network: SetupNetwork, node: int, settings: list[Setting]) -
 def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str]) -> None:
     """Writes one object and reads it back; a missing optional one becomes a remark.
 
-    A refused write may be accepted, else its error is raised:
+    A write that the drive aborts may be accepted, else its error is raised:
 
     abort code  required object           optional object                      transient value
     read-only   if it holds the value     if it holds the value, or as absent  yes
     not now     if it holds the value     if it holds the value                no
     another     no                        if it holds the value, or as absent  no
-    none        no                        no                                   no
 
-    An object counts as absent if it cannot be read or ``instead`` states the consequence. Without a
-    code a drive restarted, or another program commands or answers.
+    An object counts as absent if it cannot be read or ``instead`` states the consequence.
     """
     client = network.client(node)
     if setting.per_mille_of is not None:
@@ -370,10 +373,8 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
         setting = setting.of_rated(rated)
     try:
         client.write(setting.index, setting.sub, setting.data(), setting.name)
-    except Refused as error:
-        if "abort_code" not in error.values:
-            raise
-        code = error.values["abort_code"]
+    except SdoAborted as error:
+        code = error.abort_code
         if code in OUT_OF_RANGE and setting.equivalent and setting.value != setting.equivalent[0]:
             return _write(network, node, replace(setting, value=setting.equivalent[0]), remarks)
         if setting.transient and code in READ_ONLY:
@@ -388,7 +389,7 @@ def _write(network: SetupNetwork, node: int, setting: Setting, remarks: list[str
             raise
         if setting.instead:
             lost = "there is no" if code in OBJECT_DOES_NOT_EXIST else "the drive refuses"
-            reason = "" if code in OBJECT_DOES_NOT_EXIST else f" ({abort_text(int(code))})"
+            reason = "" if code in OBJECT_DOES_NOT_EXIST else f" ({abort_text(code)})"
             remarks.append(f"{lost} {setting}{reason}: {setting.instead}")
         return
     if setting.transient:
@@ -403,9 +404,7 @@ def _fixed_value(network: SetupNetwork, node: int, setting: Setting) -> bytes | 
     """Value of an object that cannot be written; None if it cannot be read either."""
     try:
         return network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused as error:
-        if "abort_code" not in error.values:
-            raise
+    except SdoAborted:
         return None
 
 
@@ -424,13 +423,13 @@ def _switch_off_unused(
     def is_there(index: int) -> bool:
         try:
             data = network.client(node).read(index, 1, "PDO identifier")
-        except Refused as error:
+        except SdoAborted as error:
             if not means_absent(error):
                 raise
-            code = error.values["abort_code"]
+            code = error.abort_code
             if code not in OBJECT_DOES_NOT_EXIST:
                 remarks.append(
-                    f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(int(code))}):"
+                    f"the drive refuses {index:04X}h:01 PDO identifier ({abort_text(code)}):"
                     " if it has this PDO, it stays unchanged"
                 )
             return False

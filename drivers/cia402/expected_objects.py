@@ -19,7 +19,13 @@ from drivers.cia402.sdo import NOT_NOW, WRITE_ONLY, SetupNetwork, means_absent, 
 from drivers.cia402.sdo_jobs import CSP_MODE
 from drivers.cia402.state_machine import FAULTED, DriveState
 from drivers.plausibility import WrongScale, wrong_scales
-from drivers.setup_refusals import SETTING_UP, in_fault, moved_by_another, wrong_setting
+from drivers.setup_refusals import (
+    SETTING_UP,
+    SdoAborted,
+    in_fault,
+    moved_by_another,
+    wrong_setting,
+)
 from model.errors import HardwareMissing, Refused
 from model.files.drive_profile_file import ProfileDocument, object_key, object_name
 from model.files.rig_file import Cia402Document
@@ -193,7 +199,7 @@ def require_expected(network: SetupNetwork, node: int, expected: Expectation) ->
     """
     try:
         data = network.client(node).read(expected.index, expected.sub, expected.name)
-    except Refused as error:
+    except SdoAborted as error:
         if expected.optional and means_absent(error):
             return
         error.why = error.why or f"required because: {expected.why}"
@@ -247,9 +253,7 @@ def _quotient(read: Callable[[int, int, str], bytes | None], index: int) -> floa
     """Sub-index 1 divided by sub-index 2; None if the object is missing or zero."""
     try:
         data = [read(index, sub, "position scale") for sub in (1, 2)]
-    except Refused as error:
-        if "abort_code" not in error.values:
-            raise
+    except SdoAborted:
         return None
     above, below = (int.from_bytes(each or b"", "little") for each in data)
     return above / below if above and below else None
@@ -263,9 +267,7 @@ def saved_alone(read: Callable[[int, int, str], bytes | None]) -> list[str]:
     """
     try:
         data = read(SAVED_BY_COMMAND.index, SAVED_BY_COMMAND.sub, SAVED_BY_COMMAND.name)
-    except Refused as error:
-        if "abort_code" not in error.values:
-            raise
+    except SdoAborted:
         return []
     return [HOW_SAVED] if int.from_bytes(data or b"", "little") & SAVED_BY_COMMAND.mask else []
 
@@ -335,9 +337,9 @@ def require_there(network: SetupNetwork, node: int, setting: Setting) -> None:
         return
     try:
         network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused as error:
+    except SdoAborted as error:
         # The others would be noticed only when limits have been changed.
-        if error.values.get("abort_code") not in (WRITE_ONLY, *NOT_NOW):
+        if error.abort_code not in (WRITE_ONLY, *NOT_NOW):
             raise
 
 
@@ -349,7 +351,7 @@ def require_absent(network: SetupNetwork, node: int, setting: Setting) -> None:
     """
     try:
         data = network.client(node).read(setting.index, setting.sub, setting.name, setting.size)
-    except Refused as error:
+    except SdoAborted as error:
         if not means_absent(error):
             raise
         return

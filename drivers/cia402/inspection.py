@@ -41,6 +41,7 @@ from drivers.cia402.sdo_jobs import OBJECT_DOES_NOT_EXIST
 from drivers.cia402.state_machine import FAULTED, DriveState, state_of, without_power
 from drivers.drive_group import DriveSnapshot, Pump
 from drivers.plausibility import WrongScale, winding_signs
+from drivers.setup_refusals import SdoAborted
 from model.errors import CdprError, HardwareMissing, Refused
 from model.files.drive_profile_file import ProfileDocument, object_name
 from model.rig import Rig
@@ -285,10 +286,8 @@ class _Reader:
         row.meaning = "positions must not wrap around"
         try:
             found = position_range(self._client.read_if_there)
-        except Refused as error:
-            if "abort_code" not in error.values:
-                raise
-            text = f"refused: {abort_text(int(error.values['abort_code']))}"
+        except SdoAborted as error:
+            text = f"refused: {abort_text(error.abort_code)}"
             row.note(self._node, text, "wrong", "see the drive's manual")
             return
         good = holds_limits(found, settings)
@@ -356,15 +355,13 @@ class _Reader:
         """Reads an object; None if it cannot be read, which is noted in the row."""
         try:
             return self._client.read(index, sub, row.object, size)
-        except Refused as error:
-            code = error.values.get("abort_code")
-            if code is None:
-                raise
+        except SdoAborted as error:
+            code = error.abort_code
         if code == WRITE_ONLY:
             row.note(self._node, "present, write-only")
             return None
         absent = code in OBJECT_DOES_NOT_EXIST
-        text = "absent" if absent else f"refused: {abort_text(int(code))}"
+        text = "absent" if absent else f"refused: {abort_text(code)}"
         if optional:
             good = absent and not instead
             row.note(self._node, text, "ok" if good else "remark", instead or "none required")

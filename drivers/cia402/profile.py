@@ -12,7 +12,8 @@ from pathlib import Path
 
 from drivers.can_load import heartbeat_cycles
 from drivers.cia402.state_machine import POWER_BITS, REMOTE
-from model.errors import BadInput, Refused
+from drivers.setup_refusals import SdoAborted
+from model.errors import BadInput
 from model.files.documents import load_yaml
 from model.files.drive_profile_file import (
     NEEDED,
@@ -275,9 +276,7 @@ def _is_unmonitored(
         return True
     try:
         data = read(object_key(other)[0], 0, OBJECTS[other])
-    except Refused as error:  # it may have the object
-        if "abort_code" not in error.values:
-            raise
+    except SdoAborted:  # it may have the object
         return False
     return data is None or (other == "1016h:01" and not any(data))  # no entries
 

@@ -37,7 +37,7 @@ from drivers.cia402.pdo import (
 from drivers.cia402.sdo_jobs import SdoRequest, parse_value
 from drivers.cia402.state_machine import DriveState, state_of
 from drivers.drive_group import Pump
-from drivers.setup_refusals import DriveRestarted
+from drivers.setup_refusals import DriveRestarted, SdoAborted
 from model.errors import CdprError, Fault, HardwareMissing, Refused
 
 RESPONSE_TIMEOUT = 2.0
@@ -314,7 +314,7 @@ class Client:
         """
         try:
             return self.read(index, sub, name, size)
-        except Refused as error:
+        except SdoAborted as error:
             if means_absent(error):
                 return None
             raise
@@ -371,13 +371,8 @@ class Client:
             try:
                 return transfer()
             except _Aborted as error:
-                raise Refused(
-                    f"the drive refused: {abort_text(error.code)}",
-                    where=where,
-                    next_step="compare the object with the drive's manual and its EDS file;"
-                    " `cdpr doctor RIG --drives` lists all objects of all drives",
-                    values={"node": self.node, "object": target, "abort_code": error.code},
-                ) from None
+                text = abort_text(error.code)
+                raise SdoAborted(self.node, target, error.code, text) from None
             except _NoAnswer:
                 if attempt == ATTEMPTS:
                     raise self.no_answer(where) from None
@@ -403,13 +398,13 @@ def _answers(wanted: Key, command: int, index: int, sub: int) -> bool:
     return command & _KIND == kind and (index, sub) == (wanted_index, wanted_sub)
 
 
-def means_absent(error: Refused) -> bool:
+def means_absent(error: SdoAborted) -> bool:
     """Whether the refusal of a read means that the drive lacks the object.
 
     Drives use many abort codes for that; only these say nothing about it: a time-out, and those
-    of the present state. Without a code something else answered.
+    of the present state.
     """
-    return error.values.get("abort_code") not in (None, TIMED_OUT, *NOT_NOW)
+    return error.abort_code not in (TIMED_OUT, *NOT_NOW)
 
 
 def silent(node: int, where: str) -> HardwareMissing:

@@ -83,7 +83,7 @@ class Endpoint:
         return float(struct.unpack(_FORMS[self.type], data)[0])
 
     def value_in(self, answer: bytes, node: int) -> bytes:
-        """The value at the begin of a drive's answer.
+        """The value at the beginning of a drive's answer.
 
         Raises:
             Refused: The answer is too short.
