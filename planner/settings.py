@@ -79,7 +79,11 @@ class PlannerSettings:
     readings: AlgorithmVariant = DEFAULT
 
     def __post_init__(self) -> None:
-        """Refuses unusable settings."""
+        """Refuses unusable settings.
+
+        Raises:
+            BadInput: A name is unknown, a size is not positive, or a number is out of range.
+        """
         known = {
             "sampler": ("adaptive", "goal-bias"),
             "cost": ("kinematic", "length"),
@@ -122,7 +126,12 @@ class Weights:
     capacity: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuses weights that leave nothing to minimise."""
+        """Refuses weights that leave nothing to minimise.
+
+        Raises:
+            BadInput: A weight is negative or larger than files hold, or neither the length nor
+                the kinematic cost has one.
+        """
         for entry in fields(self):
             value = getattr(self, entry.name)
             if not 0.0 <= value <= LARGEST:
@@ -191,7 +200,11 @@ class AnytimeSettings:
     rounds: int | None = None
 
     def __post_init__(self) -> None:
-        """Refuses unusable settings."""
+        """Refuses unusable settings.
+
+        Raises:
+            BadInput: The seed or the rounds are out of range, or a limit is not positive.
+        """
         object.__setattr__(self, "seed", whole_number("the seed", self.seed, most=SEED_LARGEST))
         if not 0.0 < self.budget * 1e3 <= LARGEST:
             what = f"the budget must be above 0 ms and finite, it is {self.budget * 1e3:g} ms"

@@ -166,7 +166,11 @@ class Chessboard:
     needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards."""
+        """Refuses impossible boards.
+
+        Raises:
+            BadInput: Too few inner corners, a square not above 0, or a value of another type.
+        """
         require_fields(self)
         require_board(
             min(self.columns, self.rows) >= 3,
@@ -276,7 +280,12 @@ class Charuco:
     needs_lens: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards."""
+        """Refuses impossible boards.
+
+        Raises:
+            BadInput: Too few squares, a marker that does not fit its square, a dictionary that is
+                unknown or has too few markers, or another value for ``legacy``.
+        """
         require_fields(self)
         require_board(min(self.columns, self.rows) >= 3, "a ChArUco board needs 3 squares per side")
         require_board(0.0 < self.marker < self.square, "a marker must be smaller than its square")

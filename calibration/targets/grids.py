@@ -69,7 +69,12 @@ class CircleGrid:
     needs_lens: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards."""
+        """Refuses impossible boards.
+
+        Raises:
+            BadInput: Too few circles, a size not above 0, circles that touch, or another value for
+                ``asymmetric``.
+        """
         require_fields(self)
         require_board(min(self.columns, self.rows) >= 3, "a circle grid needs 3 circles per side")
         apart = self.spacing * (np.sqrt(2.0) if self.asymmetric else 1.0)
@@ -267,7 +272,12 @@ class TagGrid:
     needs_lens: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        """Refuses impossible boards."""
+        """Refuses impossible boards.
+
+        Raises:
+            BadInput: Too few tags, a size not above 0, an unknown family, or numbers outside the
+                family.
+        """
         require_fields(self)
         require_board(self.columns * self.rows >= 4, "a tag grid needs 4 tags")
         require_board(min(self.columns, self.rows) >= 1, "a tag grid needs a row and a column")

@@ -76,7 +76,11 @@ class ImageFolder(FrameSource):
         return len(self.files)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields the images that have the camera's size."""
+        """Yields the images that have the camera's size.
+
+        Raises:
+            BadInput: None can be read or has the camera's size, or as `Camera.require_unrotated`.
+        """
         self.unused.clear()
         wanted = (self._camera.width, self._camera.height)
         none_read = True

@@ -156,7 +156,11 @@ class VideoFile(FrameSource):
         return sum(1 for _ in self)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields every image."""
+        """Yields every image.
+
+        Raises:
+            BadInput: They have another size than the camera, or none can be read.
+        """
         capture = _opened_video(self._path, self._camera)
         number, seconds, begin = 0, -1.0 / self.rate, 0.0
         try:
@@ -236,7 +240,11 @@ class LiveCamera(FrameSource):
             raise
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields images until stopped; those that arrive late or during processing are skipped."""
+        """Yields images until stopped; those that arrive late or during processing are skipped.
+
+        Raises:
+            Fault: The camera stopped delivering images.
+        """
         with suppress(StoppedByOperator):
             while True:
                 yield self.read()

@@ -76,7 +76,11 @@ class ClearanceTable(Table):
     planned_distances: Array
 
     def __post_init__(self) -> None:
-        """Refuses arrays of different sizes."""
+        """Refuses arrays of different sizes.
+
+        Raises:
+            ValueError: Naming the attribute.
+        """
         Table.__post_init__(self)
         rows, count = len(self.time), len(self.obstacles)
         for name in ("distances", "planned_distances"):

@@ -139,7 +139,11 @@ class Table:
         """Made by `dataclass`."""
 
     def __post_init__(self) -> None:
-        """Refuses attributes of different lengths."""
+        """Refuses attributes of different lengths.
+
+        Raises:
+            ValueError: Naming the attribute.
+        """
         for name in self.layout():
             if (count := len(getattr(self, name))) != len(self):
                 raise ValueError(f"{name} has {count} rows, time has {len(self)}")

@@ -33,7 +33,11 @@ class Limits:
     largest_lag: tuple[int, ...]
 
     def __post_init__(self) -> None:
-        """Refuses inconsistent limits: a missing limit would deny nothing."""
+        """Refuses inconsistent limits: a missing limit would deny nothing.
+
+        Raises:
+            ValueError: Not one whole number per drive in each, or an empty range.
+        """
         rows = (self.lowest, self.highest, self.largest_step, self.largest_lag)
         if not self.lowest or len({len(row) for row in rows}) > 1:
             raise ValueError("the safety gate needs one limit of each kind per drive")

@@ -47,7 +47,11 @@ class SyncAge:
     timeout: float = USUAL_TIMEOUT
 
     def __post_init__(self) -> None:
-        """Refuses a time-out that no cycle could meet."""
+        """Refuses a time-out that no cycle could meet.
+
+        Raises:
+            ValueError: It is not longer than one period by enough.
+        """
         if not self.timeout >= LEAST_TIMEOUT:
             raise ValueError(
                 f"drives that stop after {self.timeout} periods cannot be kept enabled"

@@ -39,7 +39,11 @@ class WrenchBox:
     half_widths: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        """Check and freeze the arrays."""
+        """Check and freeze the arrays.
+
+        Raises:
+            BadInput: A shape is wrong, a value is not finite, or a half-width is negative.
+        """
         for name in ("centre", "half_widths"):
             array = checked_wrench(getattr(self, name), name.replace("_", "-")).copy()
             array.flags.writeable = False

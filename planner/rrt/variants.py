@@ -47,7 +47,11 @@ class AlgorithmVariant:
     goal_sight: bool = False
 
     def __post_init__(self) -> None:
-        """Refuses unknown names."""
+        """Refuses unknown names.
+
+        Raises:
+            BadInput: A name is unknown or the spacing is negative or not finite.
+        """
         known: dict[str, tuple[str, ...]] = {
             "failure_rate": FAILURE_RATES,
             "focus": FOCUSES,
