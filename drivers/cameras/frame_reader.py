@@ -336,17 +336,21 @@ class FrameReader:
             time = driver_times.time(now, _stated_time(capture))
             is_on_time = schedule.is_on_time(now) or time is not None or not self._needs_times
             image = decoded(picture)
-            is_copy = image is not None and copies.is_copy(image)
-            complete = complete if image is None else now
-            new = new if image is None or is_copy else now
-            self.truncated += is_used and image is None
-            self.late += is_used and image is not None and not is_on_time
-            if image is not None and is_on_time and not (is_copy and is_used):
-                is_used, used = True, now
-                self._put(Arrived(number, now if time is None else time, image))
-            elif now > used + FROZEN:
+            if image is None:
+                self.truncated += is_used
+            else:
+                complete, is_copy = now, copies.is_copy(image)
+                new = new if is_copy else now
+                self.late += is_used and not is_on_time
+                if is_on_time and not (is_copy and is_used):
+                    is_used, used = True, now
+                    self._put(Arrived(number, now if time is None else time, image))
+            if now <= used + FROZEN:
+                continue
+            if now > complete + FROZEN:
+                self.lost = TRUNCATED
+            else:
                 self.lost = SAME if now > new + FROZEN else NOT_ON_TIME
-                self.lost = TRUNCATED if now > complete + FROZEN else self.lost
 
     def _put(self, arrived: Arrived) -> None:
         with self._changed:
