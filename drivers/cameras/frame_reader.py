@@ -21,6 +21,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model.files.reading import jpeg_segments
+
 #: Consecutive failed reads after which a camera counts as lost.
 LOST_IMAGES = 5
 #: The same without a new image on time for this long, [s]. A video codec may repeat an image of a
@@ -410,18 +412,15 @@ def _decoded_jpeg(data: NDArray[np.generic]) -> NDArray[np.generic] | None:
 
 def _single_scan(file: NDArray[np.uint8]) -> int:
     """Where the scan of a sequential JPEG file begins; 0 if it has several, or is another file."""
-    at, components = 2, 0
-    while at + 10 <= len(file) and file[at] == 0xFF:
-        marker = file[at + 1]
-        if marker == 0xFF:  # fills up
-            at += 1
-            continue
-        after = at + 2 + int.from_bytes(file[at + 2 : at + 4].tobytes())
+    components = 0
+    for marker, at in jpeg_segments(file.data):
+        if at + 8 > len(file):
+            break
         if marker in _SEQUENTIAL:
-            components = file[at + 9]
+            components = file[at + 7]
         if marker == _SCAN:
-            return after if file[at + 4] == components else 0
-        at = after
+            after = at + int.from_bytes(file[at : at + 2].tobytes())
+            return after if file[at + 2] == components else 0
     return 0
 
 

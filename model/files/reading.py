@@ -295,20 +295,31 @@ def is_too_large(data: bytes) -> bool:
 
 
 def _jpeg(data: bytes) -> tuple[int, int] | None:
-    """Size from the first frame header, found by following the markers."""
-    at = 2
-    while True:
-        sign, marker = struct.unpack_from(">BB", data, at)
-        if sign != 0xFF:
-            return None
-        at += 2 if marker != 0xFF else 1
-        if marker == 0xFF or marker in _NO_SIZE:
-            continue
+    """Size from the first frame header."""
+    for marker, at in jpeg_segments(data):
         if marker in _FRAMES:
             height, width = struct.unpack_from(">HH", data, at + 3)
             return int(width), int(height)
-        (length,) = struct.unpack_from(">H", data, at)
-        at += max(2, length)
+    return None
+
+
+def jpeg_segments(data: bytes | memoryview) -> Iterator[tuple[int, int]]:
+    """Marker of each segment of a JPEG file up to the first scan, and offset of its length.
+
+    The data may end there: segments are not known to be whole.
+    """
+    at = 2
+    with suppress(struct.error):
+        while True:
+            sign, marker = struct.unpack_from(">BB", data, at)
+            if sign != 0xFF:
+                return
+            at += 2 if marker != 0xFF else 1
+            if marker == 0xFF or marker in _NO_SIZE:
+                continue
+            yield marker, at
+            (length,) = struct.unpack_from(">H", data, at)
+            at += max(2, length)
 
 
 # Entries of a TIFF file, and of EXIF data.
