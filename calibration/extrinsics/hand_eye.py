@@ -88,38 +88,41 @@ class _Stack:
 
     @classmethod
     def of(cls, samples: Sequence[_PoseObservation]) -> _Stack:
-        return cls(
-            np.array([s.world_from_platform.rotation for s in samples]),
-            np.array([s.world_from_platform.position for s in samples]),
-            np.array([s.camera_from_tags.rotation for s in samples]),
-            np.array([s.camera_from_tags.position for s in samples]),
-            np.array([s.covariance for s in samples]),
-            np.zeros((len(samples), 6, 0)),
-        )
+        encoder = _as_arrays([s.world_from_platform for s in samples])
+        camera = _as_arrays([s.camera_from_tags for s in samples])
+        covariance = np.array([s.covariance for s in samples])
+        return cls(*encoder, *camera, covariance, np.zeros((len(samples), 6, 0)))
 
-    def gaps(self, camera: Pose, tags: Pose, test: Array) -> Array:
-        """Tag poses from the encoders minus those from the camera, shape (n, 6), [m, rad].
+    def gaps(self, cameras: Sequence[Pose], tags: Sequence[Pose], tests: Array) -> Array:
+        """Tag poses from the encoders minus those from the camera, shape (b, n, 6), [m, rad].
 
         Args:
-            camera: ``world_from_camera``.
-            tags: ``platform_from_tags``.
-            test: Test values, shape (k,).
+            cameras: ``world_from_camera``, of b guesses.
+            tags: ``platform_from_tags`` of each.
+            tests: Test values of each, shape (b, k).
         """
-        there = self.encoder @ tags.position + self.encoder_position
-        shift = self.shifts @ test
-        here = (self.camera_position + shift[:, :3]) @ camera.rotation.T + camera.position
+        (camera, eye), (tag, origin) = _as_arrays(cameras), _as_arrays(tags)
+        there = (self.encoder @ origin[:, None, :, None])[..., 0] + self.encoder_position
+        shift = (self.shifts @ tests[:, None, :, None])[..., 0]
+        here = (self.camera_position + shift[..., :3]) @ camera.transpose(0, 2, 1) + eye[:, None]
         seen = self.camera
-        if len(test):
-            seen = Rotation.from_rotvec(shift[:, 3:]).as_matrix() @ seen
-        turns = self.encoder @ tags.rotation @ (camera.rotation @ seen).transpose(0, 2, 1)
-        return np.hstack([there - here, Rotation.from_matrix(turns).as_rotvec()])
+        if tests.shape[1]:
+            rotations = Rotation.from_rotvec(shift[..., 3:].reshape(-1, 3)).as_matrix()
+            seen = rotations.reshape(*there.shape, 3) @ seen
+        turns = self.encoder @ tag[:, None] @ (camera[:, None] @ seen).transpose(0, 1, 3, 2)
+        vectors = Rotation.from_matrix(turns.reshape(-1, 3, 3)).as_rotvec()
+        return np.concatenate([there - here, vectors.reshape(there.shape)], axis=-1)
 
     def whitening(self, camera: Pose, noise: tuple[float, float]) -> Array:
         """Whitening of the gaps, shape (n, 6, 6); ``noise`` is that of the encoder poses."""
         turn = np.kron(np.eye(2), camera.rotation)
-        of_encoder = np.diag(np.repeat(np.square(noise), 3))
-        covariance = turn @ self.covariance @ turn.T + of_encoder
+        covariance = turn @ self.covariance @ turn.T + np.diag(np.repeat(np.square(noise), 3))
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _as_arrays(poses: Sequence[Pose]) -> tuple[Array, Array]:
+    """Rotations and positions."""
+    return np.array([p.rotation for p in poses]), np.array([p.position for p in poses])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,10 +266,10 @@ def _reweighted_fit(
     """
     fit = _fit(stack, start, tags, np.zeros(stack.shifts.shape[2]), _FIRST, deviations)
     for _ in range(rounds):
-        gaps = np.abs(stack.gaps(fit.world_from_camera, fit.platform_from_tags, fit.test))
+        gaps = np.abs(stack.gaps([fit.world_from_camera], [fit.platform_from_tags], fit.test[None]))
         noise = (
-            max(float(1.4826 * np.median(gaps[:, :3])), _LEAST[0]),
-            max(float(1.4826 * np.median(gaps[:, 3:])), _LEAST[1]),
+            max(float(1.4826 * np.median(gaps[..., :3])), _LEAST[0]),
+            max(float(1.4826 * np.median(gaps[..., 3:])), _LEAST[1]),
         )
         fit = _fit(stack, fit.world_from_camera, tags, fit.test, noise, deviations)
     return fit
@@ -286,21 +289,25 @@ def _fit(
         [np.zeros(6), 1.0 / np.repeat(deviations, 3), np.full(len(test), _DEFINED)]
     )
 
-    def own(x: Array) -> Array:
-        gaps = stack.gaps(moved(start, x[:6]), moved(_NOMINAL, x[6:12]), x[12:])
-        return np.asarray(np.einsum("nij,nj->ni", whitening, gaps))
+    def own(xs: Array) -> Array:  # many guesses in one call: its overhead is most of its time
+        cameras = [moved(start, x[:6]) for x in xs]
+        gaps = stack.gaps(cameras, [moved(_NOMINAL, x[6:12]) for x in xs], xs[:, 12:])
+        return np.asarray(np.einsum("nij,bnj->bni", whitening, gaps))
+
+    def residuals(xs: Array) -> Array:
+        return np.hstack([own(xs).reshape(len(xs), -1), prior[6:] * xs[:, 6:]])
 
     found = least_squares(
-        lambda x: np.concatenate([own(x).ravel(), prior[6:] * x[6:]]),
+        lambda x: residuals(x[None])[0],
         np.concatenate([np.zeros(6), step_between(_NOMINAL, tags), test]),
         loss="huber",
         f_scale=_HUBER,
         x_scale=1e-3,
         xtol=1e-12,
+        workers=lambda _, xs: residuals(np.array(list(xs))),
     )
-    x, steps = found.x, 1e-6 * np.eye(len(prior))
-    slopes = np.stack([(own(x + d) - own(x - d)) / 2e-6 for d in steps], axis=-1)
-    errors = own(x)
+    x, errors, steps = found.x, own(found.x[None])[0], 1e-6 * np.eye(len(prior))
+    slopes = np.stack([*(own(x + steps) - own(x - steps)) / 2e-6], axis=-1)
     weight = np.sqrt(np.minimum(1.0, _HUBER / np.maximum(np.abs(errors), 1e-12)))
     return _HandEyeFit(
         moved(start, x[:6]),
