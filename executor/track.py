@@ -99,11 +99,11 @@ class TrackResult(FactsDisplay):
         known = ((_LABELS.get(k, k.replace("_", " ")), v) for k, v in self.summary().items())
         return [(k.replace("picture", "image"), "–" if v is None else str(v)) for k, v in known]
 
-    def summary(self) -> dict[str, int | float | None]:
+    def summary(self) -> dict[str, int | float | str | None]:
         """Key figures, with units in their names; None where there is no pose or no image."""
         poses, logged = self.poses, self.pictures
         deviations = [float(np.linalg.norm(p.position_deviation)) for p in poses]
-        facts: dict[str, int | float | None] = {
+        facts: dict[str, int | float | str | None] = {
             "pictures": len(logged),
             "poses": len(poses),
             "position_deviation_mm": _median(deviations, 1000, 4),
@@ -118,12 +118,16 @@ class TrackResult(FactsDisplay):
         common = [float(np.sqrt(np.trace(p.shared[:3, :3]))) for p in poses if not p.unstated]
         if common:
             facts["common_deviation_mm"] = _median(common, 1000, 4)
-        clearances = [p.clearance for p in logged if p.clearance is not None]
+        # Cameras that contradict each other have no fused pose, but one of them may be right.
+        sources = [("fused", logged), *self.by_camera.items()]
+        clearances = [(p.clearance, name) for name, of in sources for p in of if p.clearance]
         if clearances:
-            nearest = min(clearances, key=lambda c: c.distance)
+            nearest, source = min(clearances, key=lambda c: c[0].distance)
             facts["smallest_clearance_mm"] = round(nearest.distance * 1000, 3)
             facts["clearance_uncertainty_mm"] = round(nearest.uncertainty * 1000, 3)
             facts["clearance_at_most_mm"] = round(nearest.at_most * 1000, 3)
+            if self.by_camera:
+                facts["clearance_source"] = source
         return facts
 
     def unused_files(self) -> dict[str, str]:
@@ -239,7 +243,7 @@ def track_sources(
         try:
             _measure(_together(streams, within, result.together, model), result, advance)
         except (CdprError, KeyboardInterrupt):
-            if result.count.poses:
+            if result.count.poses and result.pictures:
                 keep(result)
             if not result.count.pictures and stopped():
                 raise StoppedByOperator("stopped before the first image") from None

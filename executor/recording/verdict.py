@@ -367,7 +367,7 @@ def camera(
         text = f"None of {len(poses)} images gave a pose: {poses.status[0]}."
         return [Check("camera", False, text)]
     error = poses.error[poses.ok & (poses.time >= path_began)] * 1e3
-    text = f"{_camera_phrase(cameras).capitalize()} measured {seen} of {len(poses)} images"
+    text = f"Measured by {_camera_phrase(cameras)}: {seen} of {len(poses)} images"
     if len(error):
         rms, largest = float(np.sqrt(np.mean(error**2))), float(error.max())
         text += f", {rms:.2f} mm RMS from the plan (largest {largest:.2f} mm)"
@@ -378,7 +378,10 @@ def camera(
 
 
 def _camera_phrase(cameras: Sequence[CameraRecord]) -> str:
-    return f"{len(cameras)} cameras together" if len(cameras) > 1 else "the camera"
+    if len(cameras) < 2:
+        return "the camera"
+    seeing = [camera.name for camera in cameras if camera.poses]
+    return f"camera {seeing[0]} alone" if len(seeing) == 1 else f"{len(seeing)} cameras together"
 
 
 def _single_camera_phrase(record: CameraRecord) -> str:

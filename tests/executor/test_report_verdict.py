@@ -12,7 +12,7 @@ import pytest
 
 from executor.evaluation import _planned
 from executor.recording.clearance import ClearanceTable, no_clearance
-from executor.recording.record_files import RunCourse
+from executor.recording.record_files import CameraRecord, RunCourse
 from executor.recording.run_folder import RunEvent
 from executor.recording.summary import _clearance, summarize
 from executor.recording.tables import CycleTable, PoseTable
@@ -524,6 +524,21 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
     made = replace(run, poses=blind).summary
     assert made["verdict"] == "FAILED"
     assert f"None of {count} images gave a pose: no tags in the image." in made["reasons"]
+
+
+@pytest.mark.parametrize(
+    ("poses", "by"), [((9, 9), "2 cameras together"), ((0, 9), "camera side alone")]
+)
+def test_only_cameras_that_gave_a_pose_are_said_to_measure(
+    run: fake_run.FakeRun, poses: tuple[int, int], by: str
+) -> None:
+    cameras = tuple(
+        CameraRecord(name, "0", 9, seen, 9 - seen, 2.0, "")
+        for name, seen in zip(("front", "side"), poses, strict=True)
+    )
+    reasons = [text for text in summary(run, cameras=cameras)["reasons"] if by in text]
+    assert len([text for text in reasons if "images" in text]) == 1
+    assert len([text for text in reasons if "learance" in text]) >= 1
 
 
 def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:

@@ -202,6 +202,47 @@ def test_an_image_that_a_camera_lost_shifts_none_of_its_others(
         assert found.pose.distance_to(pose) < 1e-3
 
 
+@pytest.mark.parametrize(("ahead", "source"), [(0.0, None), (0.1, "side")])
+def test_a_clearance_that_one_camera_alone_measures_counts(
+    rig: Rig, scene: Scene, tmp_path: Path, ahead: float, source: str | None
+) -> None:
+    """Cameras that contradict each other have no fused pose, but one of them may be right."""
+    names = ["0.png", "1.png", "2.png"]
+    rig, sources = two_folders(rig, scene, tmp_path, {"front": names, "side": names})
+    side = next(camera for camera in sources if camera.name == "side")
+    eye = SyntheticCamera(rig, replace(scene, obstacles=()), side, seed=4)
+    nearer = Pose.level(TRUTH[1].position - np.array([ahead, 0.0, 0.0]))
+    cv2.imwrite(str(tmp_path / "side" / "1.png"), eye.render(nearer, 1))
+    block = replace(scene.obstacles[0], pose=Pose.level([-0.4, 0.1, 0.4]))
+    result = track_sources(rig, sources, scene=replace(scene, obstacles=(block,)))
+    assert len(result.poses) == (2 if ahead else 3)
+    facts = result.summary()
+    least = {
+        name: min(1e3 * one.clearance.distance for one in images if one.clearance)
+        for name, images in {"fused": result.pictures, **result.by_camera}.items()
+    }
+    assert facts["smallest_clearance_mm"] == pytest.approx(min(least.values()), abs=1e-3)
+    assert facts["clearance_source"] == min(least, key=lambda name: least[name])
+    if source is not None:
+        assert facts["clearance_source"] == source
+        assert least[source] < least["fused"] - 20.0
+
+
+def test_an_error_before_the_first_frame_set_keeps_what_was_written(
+    rig: Rig, scene: Scene, tmp_path: Path
+) -> None:
+    """An image of another size, of the second camera: nothing was measured together."""
+    names = ["0.png", "1.png", "2.png"]
+    rig, sources = two_folders(rig, scene, tmp_path, {"front": names, "side": names})
+    for name in names:
+        small = np.zeros((48, 64), np.uint8)
+        cv2.imwrite(str(tmp_path / "side" / name), small)
+    kept: list[object] = []
+    with pytest.raises(BadInput):
+        track_sources(rig, sources, keep=kept.append)
+    assert kept == []
+
+
 def test_images_missing_in_all_folders_are_remarked_on(
     rig: Rig, scene: Scene, tmp_path: Path
 ) -> None:
