@@ -194,7 +194,7 @@ def track_sources(
         stopped: Called before each image, and while a live camera delivers none; True ends
             tracking.
         keep: Called with what was measured before an error that ends tracking, unless no image gave
-            a pose; the error is then raised.
+            a pose or, with several cameras, no frame set was complete; the error is then raised.
         listener: Receives progress, files that are not used, and remarks on times.
 
     Raises:

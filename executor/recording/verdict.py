@@ -381,7 +381,7 @@ def _camera_phrase(cameras: Sequence[CameraRecord]) -> str:
     if len(cameras) < 2:
         return "the camera"
     seeing = [camera.name for camera in cameras if camera.poses]
-    return f"camera {seeing[0]} alone" if len(seeing) == 1 else f"{len(seeing)} cameras together"
+    return f"camera {seeing[0]} only" if len(seeing) == 1 else f"{len(seeing)} cameras together"
 
 
 def _single_camera_phrase(record: CameraRecord) -> str:

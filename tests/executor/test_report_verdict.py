@@ -527,7 +527,7 @@ def test_a_camera_that_never_saw_the_platform_fails_the_run(run: fake_run.FakeRu
 
 
 @pytest.mark.parametrize(
-    ("poses", "by"), [((9, 9), "2 cameras together"), ((0, 9), "camera side alone")]
+    ("poses", "by"), [((9, 9), "2 cameras together"), ((0, 9), "camera side only")]
 )
 def test_only_cameras_that_gave_a_pose_are_said_to_measure(
     run: fake_run.FakeRun, poses: tuple[int, int], by: str
@@ -539,6 +539,9 @@ def test_only_cameras_that_gave_a_pose_are_said_to_measure(
     reasons = [text for text in summary(run, cameras=cameras)["reasons"] if by in text]
     assert len([text for text in reasons if "images" in text]) == 1
     assert len([text for text in reasons if "learance" in text]) >= 1
+    own = joined(rows("tag", 20.0, 0.0, 9.0), rows("tag:side", 20.0, 0.0, 9.0))
+    texts = [check.text for check in distances(own, 0.010, cameras)]
+    assert len({*texts}) == len(texts) == 3  # no reason is stated twice
 
 
 def test_drives_that_say_they_are_simulated_are_believed_on_every_bus() -> None:
