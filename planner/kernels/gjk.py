@@ -18,6 +18,8 @@ from planner.kernels.primitives import Vector, dot, minus, norm, row
 
 _STEPS = 200
 _NO_GAIN = 1e-15
+_ROUND_OFF = 1e-14
+"""Sine of the angle below which a direction is the disc's axis, its part across it round-off."""
 
 Points = NDArray[np.float64]
 
@@ -113,20 +115,25 @@ def _nearest_along(points: Points, axis: Vector, disc: float, direction: Vector)
     point = row(points, found)
     if disc == 0.0:
         return point
-    part = dot(direction, axis)
-    across = (
-        direction[0] - part * axis[0],
-        direction[1] - part * axis[1],
-        direction[2] - part * axis[2],
-    )
+    across = _perpendicular(_perpendicular(direction, axis), axis)
     size = norm(across)
-    if size == 0.0:
+    if size <= _ROUND_OFF:
         return point
     shift = disc / size
     return (
         point[0] - shift * across[0],
         point[1] - shift * across[1],
         point[2] - shift * across[2],
+    )
+
+
+@kernel
+def _perpendicular(direction: Vector, axis: Vector) -> Vector:
+    part = dot(direction, axis)
+    return (
+        direction[0] - part * axis[0],
+        direction[1] - part * axis[1],
+        direction[2] - part * axis[2],
     )
 
 

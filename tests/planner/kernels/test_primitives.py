@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
 
 from planner.kernels.gjk import hulls_apart, hulls_distance
 from planner.kernels.primitives import (
@@ -124,6 +125,25 @@ def test_hull_grown_by_a_disc_is_a_cylinder(seed: int) -> None:
     )
     assert low <= high + EXACT
     assert low == pytest.approx(expected, rel=0, abs=1e-7)
+
+
+@settings(max_examples=400)
+@given(st.integers(0, 2**32 - 1), st.one_of(st.just(0.0), st.floats(-18.0, -2.0)))
+def test_hull_face_to_face_with_a_tilted_disc_is_as_far_as_the_planes(seed, exponent) -> None:
+    rng = np.random.default_rng(seed)
+    frame = Rotation.random(random_state=rng).as_matrix()
+    tilt = 10.0**exponent if exponent else 0.0
+    axis, radius, length, gap = frame[:, 2], *rng.uniform(0.05, 0.4, 3)
+    middle = rng.uniform(-2, 2, 3)
+    axis_ends = middle + np.outer([-0.5, 0.5], length * axis)
+    angles = np.linspace(0.0, 2.0 * np.pi, int(rng.integers(3, 7)), endpoint=False)
+    outline = np.column_stack([np.cos(angles), np.sin(angles), tilt * np.cos(angles)])
+    face = axis_ends[1] + (outline + (0.0, 0.0, gap + tilt)) @ frame.T
+    low, high = hulls_distance(face, axis_ends, vector(axis), float(radius), np.inf)
+    normal = np.array([-tilt, 0.0, 1.0]) / np.hypot(1.0, tilt)
+    expected = (gap + tilt) * normal[2] - radius * abs(normal[0])
+    assert expected - 1e-6 <= low <= expected + 10.0 * EXACT
+    assert expected - 10.0 * EXACT <= high <= expected + 1e-6
 
 
 def test_hulls_at_least_as_far_as_needed_are_apart_and_nearer_ones_are_not() -> None:
