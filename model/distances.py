@@ -130,6 +130,8 @@ PROOF_TOLERANCE = 1e-7
 #: Radius of the capsule or ball that represents a segment or point in FCL, [m]; far below the
 #: proof's tolerance, and the proof is for the segment or point itself.
 _THREAD = 1e-8
+#: Sine of the angle below which a direction is a disc's axis, its part across it round-off.
+_ROUND_OFF = 1e-14
 _NOWHERE = fcl.Transform()
 _REQUEST = fcl.DistanceRequest(enable_nearest_points=True)
 _NONE = np.zeros((0, 3))
@@ -174,9 +176,9 @@ class ConvexBody:
         """The point of the body, growth by `radius` left out, farthest along a direction."""
         point: Array = self.points[int(np.argmax(self.points @ direction))]
         if self.disc_radius:
-            across = _across(direction, self)
+            across = _across(_across(direction, self), self)
             size = float(np.linalg.norm(across))
-            if size > 0.0:
+            if size > _ROUND_OFF * float(np.linalg.norm(direction)):
                 point = point + (self.disc_radius / size) * across
         return point
 
@@ -296,7 +298,7 @@ def separation(first: ConvexBody, second: ConvexBody) -> Separation:
     near_first, near_second, normal = named
     gap = _gap(first, second, normal)
     length = float((near_second - near_first) @ normal)
-    if gap >= length - first.radius - second.radius - PROOF_TOLERANCE:
+    if abs(gap - (length - first.radius - second.radius)) <= PROOF_TOLERANCE:
         return _apart(first, second, gap, normal, near_first, near_second)
     return _searched(first, second, near_second - near_first)
 

@@ -111,6 +111,17 @@ def test_distance_of_a_box_to_every_shape_agrees_with_coal(seed: int) -> None:
 
 
 @given(seeds)
+def test_a_segment_that_ends_on_the_axis_of_a_tilted_cylinder_is_as_far_as_its_face(seed) -> None:
+    rng = np.random.default_rng(seed)
+    radius, length, gap = rng.uniform(0.05, 0.3, 3)
+    end = np.array([0.0, 0.0, length / 2 + gap])
+    pose = random_pose(rng)
+    ends = [pose.position + pose.rotation @ at for at in (end, end + rng.uniform(0.0, 1.0, 3))]
+    found = separation(segment_body(*ends), convex_bodies(Cylinder(radius, length), pose)[0])
+    assert found.distance == pytest.approx(gap, abs=1e-6)
+
+
+@given(seeds)
 def test_a_distance_proves_itself_and_its_points_lie_that_far_apart(seed: int) -> None:
     rng = np.random.default_rng(seed)
     body = segment_body(*rng.uniform(-1, 1, (2, 3)))
