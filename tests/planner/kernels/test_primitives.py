@@ -138,7 +138,7 @@ def test_hull_face_to_face_with_a_tilted_disc_is_as_far_as_the_planes(seed, expo
     axis_ends = middle + np.outer([-0.5, 0.5], length * axis)
     angles = np.linspace(0.0, 2.0 * np.pi, int(rng.integers(3, 7)), endpoint=False)
     outline = np.column_stack([np.cos(angles), np.sin(angles), tilt * np.cos(angles)])
-    face = axis_ends[1] + (outline + (0.0, 0.0, gap + tilt)) @ frame.T
+    face = axis_ends[1] + (outline + np.array([0.0, 0.0, gap + tilt])) @ frame.T
     low, high = hulls_distance(face, axis_ends, vector(axis), float(radius), np.inf)
     normal = np.array([-tilt, 0.0, 1.0]) / np.hypot(1.0, tilt)
     expected = (gap + tilt) * normal[2] - radius * abs(normal[0])
