@@ -5,6 +5,7 @@ Source: paper, section 2, Eqs. 1–3 with the corrections of docs/paper.md.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -206,15 +207,9 @@ def forward_kinematics(
             where="forward kinematics",
         )
     starts = [guess] if guess is not None else _cold_starts(rig)
-    best: ForwardSolution | None = None
-    for start in starts:
-        found = _levenberg_marquardt(rig, wanted, start, tolerance)
-        if found is None:
-            continue
-        if best is None or found.worst < best.worst:
-            best = found
-        if best.worst < 1e-7:
-            break
+    best = _best_from(rig, wanted, starts, tolerance)
+    if best is None and guess is None:  # lengths that contradict each other, as of soft cables
+        best = _best_from(rig, wanted, _settled_from(rig, wanted, starts), tolerance)
     if best is None:
         raise Fault(
             "no pose fits the cable lengths",
@@ -223,6 +218,30 @@ def forward_kinematics(
             next_step="check the drive positions and the reference (home) counts",
         )
     return best
+
+
+def _best_from(
+    rig: Rig, lengths: Array, starts: Iterable[Pose], tolerance: float
+) -> ForwardSolution | None:
+    best: ForwardSolution | None = None
+    for start in starts:
+        found = _levenberg_marquardt(rig, lengths, start, tolerance)
+        if found is None:
+            continue
+        if best is None or found.worst < best.worst:
+            best = found
+        if best.worst < 1e-7:
+            break
+    return best
+
+
+def _settled_from(rig: Rig, lengths: Array, starts: Sequence[Pose]) -> list[Pose]:
+    positions = np.array([start.position for start in starts])
+    rotations = np.array([start.rotation for start in starts])
+    sound = cables_exist(rig, anchors_at(rig, positions, rotations))
+    wanted = np.broadcast_to(lengths, (int(sound.sum()), len(lengths)))
+    settled = settled_poses_near(rig, wanted, positions[sound], rotations[sound])
+    return [Pose(*each) for each in zip(*settled, strict=True)]
 
 
 def poses_near(

@@ -93,6 +93,31 @@ def test_the_stretch_is_hookes(name: str) -> None:
     np.testing.assert_allclose(stretch, tensions * unstrained / rig.cable_stiffness, rtol=1e-9)
 
 
+def twelve_soft_cables() -> Rig:
+    """A small platform, so that lengths fit poses of almost any orientation about as well."""
+    rng, data = np.random.default_rng(1), hall_data()
+    corners = np.array([[sx, sy] for sx in (-1.0, 1.0) for sy in (-1.0, 1.0)])
+    outlets = [[2000 * x, 1500 * y, z] for z in (2600, 100, 1300) for x, y in corners]
+    anchors = [[*(100 * corner), z] for z in (-50, 50, 0) for corner in corners]
+    data["outlets_mm"] = (np.array(outlets) + rng.uniform(-50, 50, (12, 3))).tolist()
+    data["anchors_mm"] = (np.array(anchors) + rng.uniform(-33, 33, (12, 3))).tolist()
+    data["winches"] = [data["winches"][0] | {"node_id": number} for number in range(1, 13)]
+    data["cables"] |= {"stiffness_n": 2e4, "max_tension_n": 3000}
+    del data["pulleys"]
+    return rig_of(data)
+
+
+def test_counts_of_soft_cables_give_the_pose_back_over_the_whole_workspace() -> None:
+    """Stretched as at home their lengths contradict each other by millimetres."""
+    rig = twelve_soft_cables()
+    winches, rng = WinchMap(rig), np.random.default_rng(1)
+    span = rig.workspace_upper - rig.workspace_lower
+    for share in rng.uniform(0.05, 0.95, (40, 3)):
+        pose = Pose.level(rig.workspace_lower + share * span)
+        found = winches.equilibrium(winches.unstrained_from_counts(winches.counts_at(pose)))
+        assert found.distance_to(pose) < 1e-5
+
+
 @each
 def test_a_turn_of_the_drum_pays_out_its_circumference(name: str) -> None:
     rig, winches = RIGS[name], MAPS[name]
