@@ -41,16 +41,9 @@ from executor.recording.run_folder import (
 )
 from executor.recording.summary import summarize
 from executor.recording.tables import OK, CycleTable, PoseTable, fused_table
-from executor.recording.verdict import (
-    FAILED,
-    HARMLESS,
-    NOT_ENDED,
-    ORDINARY,
-    Check,
-    RunContext,
-    Verdict,
-)
+from executor.recording.verdict import FAILED, NOT_ENDED, Check, RunContext, Verdict
 from executor.report import build_report
+from executor.safety.fault_messages import HARMLESS, ORDINARY
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel

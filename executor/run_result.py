@@ -20,7 +20,7 @@ from executor.recording.clearance import ClearanceTable
 from executor.recording.record_files import free_folder
 from executor.recording.run_folder import CLEARANCE, CYCLES, POSES, RunFolder
 from executor.recording.tables import CycleTable, PoseTable
-from executor.recording.verdict import faults_among
+from executor.safety.fault_messages import faults_among
 from model.errors import BadInput, path_of
 from model.files.reading import TABLE_LIMIT
 from model.pages.page import html_table

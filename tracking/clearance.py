@@ -210,3 +210,44 @@ def require_stated_errors(
                 f" the measured platform and cables, 95 %; or run these calibrations{then}",
                 values={"camera": camera.name},
             )
+
+
+# Monitoring of measured clearance: its upper bound against the limit.
+
+
+#: Consecutive images with too small a clearance that stop the run.
+NEAR_IMAGES = 2
+
+
+class ClearanceMonitor:
+    """Detects clearance below a limit in the last images, beyond their uncertainty.
+
+    A single image may have an error that its covariance does not include.
+    """
+
+    def __init__(self, limit: float) -> None:
+        """Starts without an image.
+
+        Args:
+            limit: Clearance required by the scene, [m].
+        """
+        self._limit, self._pictures = limit, 0
+
+    def take(self, clearance: MeasuredClearance | None) -> str:
+        """The pair below the limit, with values, if the last images agree; else empty.
+
+        Args:
+            clearance: Of the newest image with a pose; None in a scene without obstacles.
+        """
+        if clearance is None or clearance.at_most >= self._limit:
+            self._pictures = 0
+            return ""
+        self._pictures += 1
+        if self._pictures < NEAR_IMAGES:
+            return ""
+        near, spread = clearance.upper_bound
+        return (
+            f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm"
+            f" ({INTERVAL});"
+            f" the scene requires {self._limit * 1e3:g} mm"
+        )

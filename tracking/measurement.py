@@ -6,13 +6,16 @@ import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from model.cameras import Z_95
 from model.pose import (
     Array,
     Pose,
+    interpolate,
     matrix_from_rotation_vector,
     read_only,
     rotation_vector_from_matrix,
@@ -314,3 +317,63 @@ def rejection_reason(
 def edge_count(views: Sequence[TagView]) -> int:
     """Number of measured edges."""
     return sum(int(view.seen.edges.sum()) for view in views)
+
+
+# Comparison with the encoders along a run.
+
+
+#: Consecutive images off the encoder pose that are reported.
+OFF_IMAGES = 10
+_CHI_95 = 2.7955  # of three dimensions: 95 % of errors are within that many deviations
+
+
+class EncoderPoses:
+    """The newest platform poses from the encoders, between which images are taken."""
+
+    def __init__(self) -> None:
+        self._poses: deque[tuple[float, Pose | None]] = deque(maxlen=100)
+
+    def add(self, time: float, pose: Pose | None) -> None:
+        """Takes the next pose; None where the positions of the drives fit none."""
+        self._poses.append((time, pose))
+
+    def at(self, time: float) -> Pose | None:
+        """The pose at a time [s]; None if it is unknown there."""
+        for (start, first), (end, second) in pairwise(self._poses):
+            if start <= time <= end and first is not None and second is not None:
+                share = (time - start) / (end - start) if end > start else 0.0
+                return interpolate(first, second, share)
+        return None
+
+
+class PoseMonitor:
+    """Detects that measured positions differ from the encoders' by more than errors explain."""
+
+    def __init__(self, tolerance: float, platform_error: float) -> None:
+        """Starts without an image.
+
+        Args:
+            tolerance: Difference that the drives are allowed, [m].
+            platform_error: Of the encoder position along any axis, 95 %, [m].
+        """
+        self._tolerance, self._platform = tolerance, (platform_error / Z_95) ** 2 * np.eye(6)
+        self._images = 0
+
+    def take(self, measured: PoseMeasurement, encoder_pose: Pose | None) -> str:
+        """How far the last `OFF_IMAGES` images are off, once; else empty.
+
+        Args:
+            encoder_pose: At the time of the image; None where it is unknown.
+        """
+        if self._images >= OFF_IMAGES or measured.unstated or encoder_pose is None:
+            return ""
+        distance = measured.pose.distance_to(encoder_pose)
+        covariance = measured.covariance + measured.shared + self._platform
+        explained = self._tolerance + _CHI_95 * largest_deviations(covariance)[0]
+        self._images = self._images + 1 if distance > explained else 0
+        if self._images < OFF_IMAGES:
+            return ""
+        return (
+            f"{distance * 1e3:.1f} mm from its encoder pose, in {OFF_IMAGES} images in a row;"
+            f" tolerances and stated errors (95 %) explain {explained * 1e3:.1f} mm"
+        )

@@ -11,7 +11,7 @@ from cdpr.cli.arguments import argument, option
 from cdpr.cli.options import CALIBRATION, JSON, calibrated_rig, require_unused
 from cdpr.cli.output import Terminal, out, show_facts, show_json, show_line
 from drivers.stopping_distance import stopping_remarks
-from executor.recording.verdict import fault_titles, page_of_fault
+from executor.safety.fault_messages import fault_titles, page_of_fault
 from model.plan import load_plan, require_same_rig
 from model.rig import load_rig
 from model.scene import legs_of

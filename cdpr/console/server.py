@@ -34,7 +34,7 @@ from cdpr.console.state import StateFlow, StateTimes, plans_and_scenes
 from cdpr.console.view import scene_of
 from executor.realtime.scheduling import prompt_threads, take_short_turns
 from executor.recording.record_files import RUNS
-from executor.recording.verdict import fault_codes, page_text
+from executor.safety.fault_messages import fault_codes, page_text
 from model.errors import BadInput
 
 #: States per second.

@@ -14,52 +14,11 @@ from executor.supervision import RequestBoard, StopReason
 from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.progress import SILENT, Listener
-from tracking.clearance import INTERVAL, MeasuredClearance, clearance_of
+from tracking.clearance import ClearanceMonitor, MeasuredClearance, clearance_of
 from tracking.fusion import MultiCameraFusion
-from tracking.measurement import PoseMeasurement, rates
+from tracking.measurement import EncoderPoses, PoseMeasurement, PoseMonitor, rates
 
-# Monitoring of measured clearance: its upper bound against the limit.
-
-
-#: Consecutive images with too small a clearance that stop the run.
-NEAR_IMAGES = 2
-
-
-class ClearanceMonitor:
-    """Detects clearance below a limit in the last images, beyond their uncertainty.
-
-    A single image may have an error that its covariance does not include.
-    """
-
-    def __init__(self, limit: float) -> None:
-        """Starts without an image.
-
-        Args:
-            limit: Clearance required by the scene, [m].
-        """
-        self._limit, self._pictures = limit, 0
-
-    def take(self, clearance: MeasuredClearance | None) -> str:
-        """The pair below the limit, with values, if the last images agree; else empty.
-
-        Args:
-            clearance: Of the newest image with a pose; None in a scene without obstacles.
-        """
-        if clearance is None or clearance.at_most >= self._limit:
-            self._pictures = 0
-            return ""
-        self._pictures += 1
-        if self._pictures < NEAR_IMAGES:
-            return ""
-        near, spread = clearance.upper_bound
-        return (
-            f"{near.first} to {near.second}: {near.distance * 1e3:.1f} ± {spread * 1e3:.1f} mm"
-            f" ({INTERVAL});"
-            f" the scene requires {self._limit * 1e3:g} mm"
-        )
-
-
-# Fusion of several cameras, and their clearance monitors.
+# Fusion of several cameras, and monitors of what they measure.
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,9 +35,9 @@ class CameraNews:
 
 
 class MultiCameraMonitor:
-    """Fuses the samples of all cameras, frame by frame, and monitors their clearance.
+    """Fuses the samples of all cameras, frame by frame, and monitors their clearance and pose.
 
-    The fused clearance and that of each camera are monitored, so no camera delays or prevents a
+    The fused measurement and that of each camera are monitored, so no camera delays or prevents a
     stop for which another one suffices.
     """
 
@@ -99,9 +58,13 @@ class MultiCameraMonitor:
         # Of the fused pose ("") and of each camera: fusion with a poor one must not hide what a
         # good one measures, and if they disagree, the correct one is unknown.
         self._watches = {name: ClearanceMonitor(limit) for name in ("", *names)}
+        self._encoders, motion = EncoderPoses(), model.rig.motion
+        explained = motion.start_tolerance + motion.following_error, model.rig.platform_error or 0.0
+        self._poses = {name: PoseMonitor(*explained) for name in self._watches}
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
         self._moments = self._disagree = 0
+        self._differs = False
 
     def of(self, samples: Mapping[str, CameraSample]) -> CameraSample:
         """The fused sample of a frame.
@@ -117,8 +80,7 @@ class MultiCameraMonitor:
         clearance = None
         if isinstance(found, PoseMeasurement):
             self._count_disagreement("")
-            clearance = clearance_of(self._model, found)
-            self._watch("", clearance)
+            clearance = self._watch("", found)
         else:
             seen = any(isinstance(one, PoseMeasurement) for one in each.values())
             self._count_disagreement(found.reason if seen else "")
@@ -130,7 +92,11 @@ class MultiCameraMonitor:
     def watch_alone(self, name: str, sample: CameraSample) -> None:
         """Monitors what one of several cameras measured, also too late to be fused."""
         if isinstance(sample.found, PoseMeasurement):
-            self._watch(name, clearance_of(self._model, sample.found))
+            self._watch(name, sample.found)
+
+    def drive(self, time: float, encoder_pose: Pose | None) -> None:
+        """Takes the platform pose from the encoders at a time since the start of the run, [s]."""
+        self._encoders.add(time, encoder_pose)
 
     def finish(self) -> None:
         """Reports images left out because they were too far apart in time, and unequal clocks."""
@@ -143,10 +109,17 @@ class MultiCameraMonitor:
             )
             self.news.append(CameraNews("pictures_dropped", text))
 
-    def _watch(self, name: str, clearance: MeasuredClearance | None) -> None:
+    def _watch(self, name: str, found: PoseMeasurement) -> MeasuredClearance | None:
+        clearance = clearance_of(self._model, found)
         near = self._watches[name].take(clearance)
         if near and not self.near:
             self.near = near + (f", measured by camera {name} alone" if name else "")
+        off = self._poses[name].take(found, self._encoders.at(found.time))
+        if off and not self._differs:
+            self._differs = True
+            who = f"camera {name}" if name else "the cameras" if self._several else "the camera"
+            self.news.append(CameraNews("pose_differs", f"{who} measured the platform {off}"))
+        return clearance
 
     def _count_disagreement(self, reason: str) -> None:
         self._disagree = self._disagree + 1 if reason else 0
@@ -246,6 +219,7 @@ class RunCameras:
             encoder_pose: Platform pose from the encoders; None if unknown.
         """
         self._now = asked
+        self._common.drive(time, encoder_pose)
         for client in self._clients:
             self._put(client, client.collect())
         self._process_complete()

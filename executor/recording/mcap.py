@@ -32,7 +32,8 @@ from executor.recording.mcap_channels import (
 from executor.recording.run_folder import PLAN, RIG, RunFolder
 from executor.recording.table_files import Column
 from executor.recording.tables import OK, CycleTable, FusedTable, PoseTable
-from executor.recording.verdict import RunContext, faults_among
+from executor.recording.verdict import RunContext
+from executor.safety.fault_messages import faults_among
 from model.errors import Fault
 from tracking.clearance import COVERAGE, MeasuredClearance
 from tracking.measurement import NoPose

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 
 import numpy as np
 
@@ -16,9 +14,7 @@ from executor.recording.run_folder import RunEvent
 from executor.recording.tables import CycleTable, PoseTable
 from executor.safety.fault_messages import LARGEST_SHARE, NO_MORE
 from executor.safety.limits import tension_limits
-from executor.state_machine import REMARK, SIMULATED, State
-from model.errors import BadInput
-from model.files.reading import ready_folder
+from executor.state_machine import SIMULATED, State
 from model.plan import Plan
 from model.pose import Pose
 from model.rig import Rig
@@ -120,6 +116,7 @@ def judge(
         *distances(clearance, scene.obstacle_clearance, course.cameras, began, rig.platform_error),
         *encoder_pose(cycles),
         *camera(poses, course.cameras, began),
+        *(Check("camera_pose", False, _sentence(t)) for t in context.texts_of("pose_differs")),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
         *unheld,
         *(Check("record", False, f"{trouble}.") for trouble in course.troubles),
@@ -377,6 +374,10 @@ def camera(
     return [Check("camera", True, text)]
 
 
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def _camera_phrase(cameras: Sequence[CameraRecord]) -> str:
     if len(cameras) < 2:
         return "the camera"
@@ -388,63 +389,3 @@ def _single_camera_phrase(record: CameraRecord) -> str:
     """Poses and images of one of several cameras, and why it failed."""
     failed = f" ({record.failed})" if record.failed else ""
     return f"{record.name} {record.poses} of {record.pictures}{failed}"
-
-
-# Documentation of faults: a page for every event code that is a fault.
-
-
-#: Codes of events of a good run, or of operator requests.
-ORDINARY = frozenset(
-    {
-        *("enabled", "moving", "hold", "resume", "speed", "stop", "held"),
-        *("pass", "pick", "place", "leaving", SIMULATED, REMARK, "traceback"),
-    }
-)
-#: Codes of events with a page that do not stop a run.
-HARMLESS = {"reply_lost", "set_point_missed", "drive_warning", "no_real_time", "jog_not_begun"}
-#: Those of cameras: a run that measured nothing does not pass.
-_HARMLESS_OF_CAMERAS = frozenset({"camera_sees_nothing", "pictures_dropped"})
-
-
-def page_of(code: str) -> str:
-    """Path of the page about a fault; empty for other events."""
-    return f"docs/faults/{code}.md" if code in fault_codes() else ""
-
-
-def fault_codes() -> list[str]:
-    """Codes of all faults that have a page."""
-    pages = ready_folder("docs/faults").glob("*.md")
-    return sorted(page.stem for page in pages if page.stem != "index")
-
-
-def faults_among(codes: Iterable[str]) -> list[str]:
-    """Fault codes among event codes, each once, in order; those that stop no run are last."""
-    known = fault_codes()
-    found = [code for code in dict.fromkeys(codes) if code in known]
-    return sorted(found, key=lambda code: (code in HARMLESS, code in _HARMLESS_OF_CAMERAS))
-
-
-def page_text(code: str) -> str:
-    """The page about a fault of `fault_codes`, as Markdown without links."""
-    text = (ready_folder("docs/faults") / f"{code}.md").read_text(encoding="utf-8")
-    return re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", text)
-
-
-def page_of_fault(code: str) -> str:
-    """The page about a fault of a user-given code; see `page_text`.
-
-    Raises:
-        BadInput: There is no such code; with the nearest, or all codes.
-    """
-    codes = fault_codes()
-    if code in codes:
-        return page_text(code)
-    near = get_close_matches(code, codes, n=1)
-    next_step = f"run `cdpr explain {near[0]}`" if near else f"use one of: {', '.join(codes)}"
-    raise BadInput(f"there is no fault code {code!r}", where="cdpr explain", next_step=next_step)
-
-
-def fault_titles() -> dict[str, str]:
-    """Titles of all pages about faults, by code."""
-    first_lines = ((code, page_text(code).split("\n", 1)[0]) for code in fault_codes())
-    return {code: line.removeprefix("# ") for code, line in first_lines}

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from executor.recording.tables import PoseTable
-from executor.recording.verdict import NOT_ENDED, faults_among, page_of, page_text
+from executor.recording.verdict import NOT_ENDED
 from executor.report.run_data import RunData, markdown, missing_images
+from executor.safety.fault_messages import faults_among, page_of, page_text
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
 from model.files.reading import is_too_large
 from model.pages.page import known, list_table, paragraph, prose, table, tile, tiles

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from enum import IntEnum
+
+from executor.state_machine import REMARK, SIMULATED
+from model.errors import BadInput
+from model.files.reading import ready_folder
 
 
 class StopReaction(IntEnum):
@@ -206,3 +212,63 @@ def name_drives(failed: Sequence[str], drives: int) -> tuple[str, str]:
 
 def _without_name(alarm: Alarm, names: Sequence[str]) -> str:
     return alarm.text.removeprefix(f"{names[alarm.drive - 1]} ") if alarm.drive else ""
+
+
+# Documentation of faults: a page for every event code that is a fault.
+
+
+#: Codes of events of a good run, or of operator requests.
+ORDINARY = frozenset(
+    {
+        *("enabled", "moving", "hold", "resume", "speed", "stop", "held"),
+        *("pass", "pick", "place", "leaving", SIMULATED, REMARK, "traceback"),
+    }
+)
+#: Codes of events with a page that do not stop a run.
+HARMLESS = {"reply_lost", "set_point_missed", "drive_warning", "no_real_time", "jog_not_begun"}
+#: Those of cameras: a run that measured nothing, or a platform elsewhere, does not pass.
+_HARMLESS_OF_CAMERAS = frozenset({"camera_sees_nothing", "pictures_dropped", "pose_differs"})
+
+
+def page_of(code: str) -> str:
+    """Path of the page about a fault; empty for other events."""
+    return f"docs/faults/{code}.md" if code in fault_codes() else ""
+
+
+def fault_codes() -> list[str]:
+    """Codes of all faults that have a page."""
+    pages = ready_folder("docs/faults").glob("*.md")
+    return sorted(page.stem for page in pages if page.stem != "index")
+
+
+def faults_among(codes: Iterable[str]) -> list[str]:
+    """Fault codes among event codes, each once, in order; those that stop no run are last."""
+    known = fault_codes()
+    found = [code for code in dict.fromkeys(codes) if code in known]
+    return sorted(found, key=lambda code: (code in HARMLESS, code in _HARMLESS_OF_CAMERAS))
+
+
+def page_text(code: str) -> str:
+    """The page about a fault of `fault_codes`, as Markdown without links."""
+    text = (ready_folder("docs/faults") / f"{code}.md").read_text(encoding="utf-8")
+    return re.sub(r"\[([^]]+)\]\([^)]*\)", r"\1", text)
+
+
+def page_of_fault(code: str) -> str:
+    """The page about a fault of a user-given code; see `page_text`.
+
+    Raises:
+        BadInput: There is no such code; with the nearest, or all codes.
+    """
+    codes = fault_codes()
+    if code in codes:
+        return page_text(code)
+    near = get_close_matches(code, codes, n=1)
+    next_step = f"run `cdpr explain {near[0]}`" if near else f"use one of: {', '.join(codes)}"
+    raise BadInput(f"there is no fault code {code!r}", where="cdpr explain", next_step=next_step)
+
+
+def fault_titles() -> dict[str, str]:
+    """Titles of all pages about faults, by code."""
+    first_lines = ((code, page_text(code).split("\n", 1)[0]) for code in fault_codes())
+    return {code: line.removeprefix("# ") for code, line in first_lines}

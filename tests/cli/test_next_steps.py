@@ -25,10 +25,10 @@ from executor.drives import DriveStatus, is_simulated
 from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import BEGUN, RunFolder
-from executor.recording.verdict import page_text
 from executor.remote.client import request_run as request
 from executor.remote.command_server import commands_from_start
 from executor.run_result import RunResult
+from executor.safety.fault_messages import page_text
 from executor.service import StatusResult
 from executor.supervision import Supervisor
 from model.errors import BadInput, Fault

@@ -13,8 +13,8 @@ import pytest
 
 from drivers.can_errors import BusFault
 from drivers.stopping_distance import lost_master
-from executor.recording.verdict import ORDINARY, fault_codes, faults_among, page_of, page_text
 from executor.report.run_data import markdown
+from executor.safety.fault_messages import ORDINARY, fault_codes, faults_among, page_of, page_text
 from model.files.scene_file import StopDocument
 from model.rig import load_rig
 from tests.cli.program import call, one_message
@@ -132,12 +132,12 @@ def harmless_by_the_index() -> list[str]:
 
 def test_the_codes_that_stop_no_run_are_those_of_the_index() -> None:
     codes = harmless_by_the_index()
-    assert len(codes) == 7
+    assert len(codes) == 8
     for code in codes:
         assert faults_among([code, "cable_loose"]) == ["cable_loose", code]
 
 
-@pytest.mark.parametrize("code", ["camera_sees_nothing", "pictures_dropped"])
+@pytest.mark.parametrize("code", ["camera_sees_nothing", "pictures_dropped", "pose_differs"])
 def test_what_cameras_missed_may_fail_a_run_and_comes_before_what_does_not(code: str) -> None:
     assert faults_among(["drive_warning", code]) == [code, "drive_warning"]
 

@@ -42,7 +42,7 @@ from model.pose import Pose
 from model.rig import load_rig
 from tests.cli.plans import RIG, free_scene
 from tracking.clearance import MeasuredClearance, clearance_of
-from tracking.measurement import FrameRate, PoseMeasurement
+from tracking.measurement import OFF_IMAGES, FrameRate, PoseMeasurement, PoseMonitor
 
 RATE = 10.0
 HERE = Pose.level([0.0, 0.0, 0.445])
@@ -121,6 +121,26 @@ class Scripted:
         if self._blind:
             return sample_without_pose(trigger.frame, trigger.time, "no tag")
         return seen_at(trigger, **self._off)
+
+
+def at_time(time: float) -> Pose:
+    """The pose of a platform that moves along x at 1 m/s."""
+    return Pose(HERE.position + np.array([time, 0.0, 0.0]), HERE.rotation)
+
+
+class Moving(Scripted):
+    """A camera that sees a platform move, in images taken some time after the request."""
+
+    def __init__(self, name: str, delays: Sequence[int], late: float) -> None:
+        super().__init__(name, delays)
+        self._late = late
+
+    def answer_within(self, patience: float) -> CameraSample | None:
+        asked = self.unanswered
+        if asked is not None:
+            shift = at_time(asked.time + self._late).position[0] - HERE.position[0]
+            self._off = {"shift": shift, "late": self._late}
+        return super().answer_within(patience)
 
 
 def never() -> bool:
@@ -268,6 +288,55 @@ def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(w
     assert not any(reported[:2])
     assert f"measured by camera {sees} alone" in run.near
     assert all(look.clearance is None for look in run.finish(never).together)
+
+
+@pytest.mark.parametrize("names", [("front",), ("front", "side")])
+@pytest.mark.parametrize(("shift_mm", "images"), [(20.0, 10), (20.0, 9), (2.5, 30), (-20.0, 30)])
+def test_a_platform_off_its_encoder_pose_is_reported_once(
+    names: tuple[str, ...], shift_mm: float, images: int
+) -> None:
+    """The rig's tolerances, 3 mm together, and the camera's errors are no difference."""
+    eyes = [CameraClient(Scripted(name, [0], shift_mm / 1e3), "here") for name in names]  # type: ignore[arg-type]
+    run, reported = RunCameras(eyes, MODEL, 0.0, RATE), []
+    for k in range(images + 1):
+        run.trigger(k / RATE, k / RATE, None, HERE)
+        reported += [news for news in run.news() if news.code == "pose_differs"]
+    if abs(shift_mm) < 3.0 or images < OFF_IMAGES:
+        assert not reported
+        return
+    (news,) = reported
+    who = "the cameras" if len(names) > 1 else "the camera"
+    assert news.text.startswith(f"{who} measured the platform {abs(shift_mm):.1f} mm from its")
+
+
+@pytest.mark.parametrize("known", [True, False])
+@given(late=st.floats(0.0, 0.1))
+def test_a_moving_platform_is_compared_with_the_encoders_at_the_time_of_the_image(
+    known: bool, late: float
+) -> None:
+    """At 1 m/s, where a whole request apart it would be 100 mm off."""
+    run: Any = RunCameras([CameraClient(Moving("front", [1], late), "here")], MODEL, 0.0, RATE)
+    for k in range(30):
+        run.trigger(k / RATE, k / RATE, None, at_time(k / RATE) if known else None)
+        assert not run.news()
+
+
+def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
+    monitor = PoseMonitor(0.003, 0.0)
+    found = seen_at(FrameRequest(0, 0.0, 0.0, None), 0.02).found
+    assert isinstance(found, PoseMeasurement)
+    unstated, common = replace(found, unstated=True), replace(found, shared=1e-4 * np.eye(6))
+    assert not any(monitor.take(one, HERE) for one in [unstated, common] * 20)
+    assert [bool(monitor.take(found, HERE)) for _ in range(12)] == [k == 9 for k in range(12)]
+
+
+@given(share=st.floats(0.5, 1.5))
+def test_the_stated_error_of_the_rig_explains_its_difference(share: float) -> None:
+    """95 % along any axis is 1.43 times as much for a distance in space."""
+    monitor, error = PoseMonitor(0.003, 0.01), 0.003 + share * 0.01 * 2.7955 / 1.96
+    found = seen_at(FrameRequest(0, 0.0, 0.0, None), error, deviation=1e-6).found
+    assert isinstance(found, PoseMeasurement)
+    assert any(monitor.take(found, HERE) for _ in range(10)) == (share > 1.0 + 1e-6)
 
 
 #: Each frame of a camera: what it measures beside the truth along x, [mm]; None without a pose.

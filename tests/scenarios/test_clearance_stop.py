@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import yaml
 
-from executor.cameras.multi_camera import ClearanceMonitor
 from executor.cameras.process import CameraWorker, FrameRequest
 from executor.recording.run_folder import RunFolder
 from executor.state_machine import State
@@ -28,7 +27,7 @@ from simulation.camera.camera import SyntheticCamera
 from tests.cli.plans import GOAL_MM, RIG, START_MM, straight_plan
 from tests.cli.program import call
 from tests.scenarios.stage import at, staged
-from tracking.clearance import clearance_of
+from tracking.clearance import ClearanceMonitor, clearance_of
 from tracking.measurement import PoseMeasurement
 
 #: True offset of the platform towards the block, [m].
@@ -119,7 +118,11 @@ def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
     assert "off (--no-clearance-stop, in Python clearance_stop=False)" in answer.out
     assert summary["final_state"] != "stopped"
     assert "clearance_low" not in list(events_of(run))
-    assert "clearance_tag" in [c["name"] for c in summary["checks"] if not c["passed"]]
+    failed = {c["name"]: c["text"] for c in summary["checks"] if not c["passed"]}
+    assert "clearance_tag" in failed
+    (differs,) = (e["text"] for e in summary["events"] if e["code"] == "pose_differs")
+    assert re.search(r"the platform 5\.\d mm from its encoder pose, in 10 images in a row", differs)
+    assert failed["camera_pose"].lower() == f"{differs}.".lower()
 
 
 def test_to_leave_out_a_stop_that_no_camera_could_make_is_refused(

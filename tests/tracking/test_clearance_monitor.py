@@ -12,11 +12,10 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from executor.cameras.multi_camera import NEAR_IMAGES, ClearanceMonitor
 from executor.recording.clearance import ClearanceRow, clearance_table
 from executor.recording.verdict import distances
 from model.clearance import Nearest
-from tracking.clearance import MeasuredClearance
+from tracking.clearance import NEAR_IMAGES, ClearanceMonitor, MeasuredClearance
 
 #: Clearance required by the scene, [mm].
 LIMIT_MM = 20.0

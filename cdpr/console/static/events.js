@@ -9,8 +9,8 @@ export const HELP = new Set([
   "broken", "bus_down", "bus_errors", "bus_failed", "bus_gone", "bus_lost", "bus_off", "bus_passive", "cable_loose", "camera",
   "camera_sees_nothing", "clearance_low", "drive_fault", "drive_silent", "drive_stuck", "drive_warning", "following_error",
   "foreign_master", "gate_denied", "hold_timeout", "jog_not_begun", "late", "no_real_time", "not_held", "not_taut", "over_tension",
-  "pictures_dropped", "real_time_lost", "receive_overflow", "recorder", "reply_lost", "set_point_missed", "slack",
-  "stop_not_sent", "supervisor_lost", "transmit_queue_full", "went_slack",
+  "pictures_dropped", "pose_differs", "real_time_lost", "receive_overflow", "recorder", "reply_lost", "set_point_missed",
+  "slack", "stop_not_sent", "supervisor_lost", "transmit_queue_full", "went_slack",
 ]);
 
 /** Keeps the events of all motions since the page was opened, newest first. */
