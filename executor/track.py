@@ -241,7 +241,7 @@ def track_sources(
                 on_image=draw,
             )
         try:
-            _measure(_together(streams, within, result.together, model), result, advance)
+            _measure(_together(rig, streams, within, result.together, model), result, advance)
         except (CdprError, KeyboardInterrupt):
             if result.count.poses and result.pictures:
                 keep(result)
@@ -360,6 +360,7 @@ def _measure(
 
 
 def _together(
+    rig: Rig,
     streams: dict[str, Iterator[LoggedImage]],
     within: float,
     count: MultiCameraCount | None,
@@ -367,10 +368,8 @@ def _together(
 ) -> Iterator[tuple[LoggedImage, dict[str, LoggedImage]]]:
     """Fused measurements, with those of each camera."""
     if count is not None:
-        yield from track_cameras(streams, within, count, model)
-        return
-    for name, stream in streams.items():
-        yield from ((found, {name: found}) for found in stream)
+        return track_cameras(rig, streams, within, count, model)
+    return ((found, {name: found}) for name, stream in streams.items() for found in stream)
 
 
 def _without_copies(frames: Iterable[SourceImage], check: CopyCheck) -> Iterator[SourceImage]:

@@ -143,6 +143,15 @@ def camera_by_name(cameras: Sequence[Camera], name: str | None, where: str) -> C
     return cameras[names.index(name)]
 
 
+def exchanged_sources(name: str, other: str) -> tuple[str, str]:
+    """Cause and next step where the images of a camera seem to be those of another one."""
+    return (
+        f"the image source of {name!r} seems to be that of {other!r}",
+        f"exchange the sources of cameras {name!r} and {other!r} (a single source is named"
+        f" {other}=SOURCE), and do not calibrate them again",
+    )
+
+
 def camera_from(document: CameraDocument) -> Camera:
     """The camera that a rig file describes."""
     matrix = [

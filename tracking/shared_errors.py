@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import ndtr
 
-from model.cameras import Z_95
+from model.cameras import Z_95, exchanged_sources
 from model.errors import Fault
 from model.pose import Array, Pose, read_only, skew
 from model.rig import Camera, Rig, Tag
@@ -361,7 +361,7 @@ def require_unmoved_camera(
     views: Sequence[TagView],
     limit_px: float,
     before: CameraCheck | None,
-    family: str,
+    rig: Rig,
 ) -> CameraCheck | None:
     """Checks the camera's pose if frame tags are visible.
 
@@ -372,6 +372,7 @@ def require_unmoved_camera(
         views: Of frame tags.
         limit_px: Largest median error of the tags.
         before: The check of the last image; None if it passed.
+        rig: Its tags, and cameras with which this one may be exchanged.
 
     Returns:
         The check, or None if no frame tag is completely visible.
@@ -396,7 +397,7 @@ def require_unmoved_camera(
         return check_camera(camera, rotated).error <= limit_px
 
     stated = [view.tag for view in views]
-    mounted = mounted_rotated(stated, family, fit) if len(check.tags) > 1 else None
+    mounted = mounted_rotated(stated, rig.tag_family, fit) if len(check.tags) > 1 else None
     if mounted is not None:
         raise CameraMoved(
             f"frame tags {values['frame_tags']} are not mounted as the rig file states",
@@ -405,19 +406,30 @@ def require_unmoved_camera(
             next_step=mounted[1],
             values=values,
         )
-    by = ""
+    what = f"camera {camera.name!r} is not at the pose in the rig file"
+    why = (
+        f"reprojection error {check.error:.2f} px ({check.distance * 1e3:.1f} mm), limit"
+        f" {limit_px:g} px: the camera or the tags were moved, or the lens refocused"
+    )
+    next_step = (
+        "restore it, or calibrate its pose again and write it into the rig file under cameras:"
+        " world_from_camera"
+    )
     found = measured_camera(camera, views)
     if found is not None:
         shift = camera.world_from_camera.distance_to(found[0])
         turn = float(np.degrees(camera.world_from_camera.angle_to(found[0])))
         values |= {"moved_mm": round(shift * 1e3, 1), "turned_deg": round(turn, 3)}
-        by = f": it is off by {shift * 1e3:.1f} mm and {turn:.2f}°"
-    raise CameraMoved(
-        f"camera {camera.name!r} is not at the pose in the rig file{by}",
-        where=f"frame tags {values['frame_tags']}",
-        why=f"reprojection error {check.error:.2f} px ({check.distance * 1e3:.1f} mm), limit"
-        f" {limit_px:g} px: the camera or the tags were moved, or the lens refocused",
-        next_step="restore it, or calibrate its pose again and write it into the rig file under"
-        " cameras: world_from_camera",
-        values=values,
-    )
+        what += f": it is off by {shift * 1e3:.1f} mm and {turn:.2f}°"
+        gaps = {c.name: pose_gap(c.world_from_camera, found[0]) for c in (*rig.cameras, camera)}
+        nearest = min(gaps, key=gaps.__getitem__)
+        if nearest != camera.name and gaps[nearest] <= 1.0:
+            what = f"the images of camera {camera.name!r} are from the pose of camera {nearest!r}"
+            why, next_step = exchanged_sources(camera.name, nearest)
+    where = f"frame tags {values['frame_tags']}"
+    raise CameraMoved(what, where=where, why=why, next_step=next_step, values=values)
+
+
+def pose_gap(a: Pose, b: Pose) -> float:
+    """Distance of two poses, 1 at 50 mm or 2°: errors of a rig file explain no more."""
+    return max(a.distance_to(b) / 0.05, float(np.degrees(a.angle_to(b))) / 2.0)

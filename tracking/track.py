@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from model.cameras import exchanged_sources
 from model.clearance import ClearanceModel
 from model.errors import BadInput
 from model.pose import Array, Pose
@@ -32,7 +33,7 @@ from tracking.measurement import (
     PoseMeasurement,
 )
 from tracking.pose_log import LoggedImage
-from tracking.shared_errors import PERHAPS_MOVED
+from tracking.shared_errors import PERHAPS_MOVED, pose_gap
 from tracking.tracker import Tracker
 
 
@@ -170,7 +171,7 @@ def _nothing_seen(
     elif UNCERTAIN in reason and not soft:
         next_step = "focus the camera, bring it nearer, or make more tags of the platform visible"
     elif PERHAPS_MOVED in reason:
-        next_step = "take more images; if the camera moved, restore it or calibrate its pose again"
+        next_step = "take more images: the next one that shows the frame tags decides"
     elif UNSHARP in reason or soft:
         next_step = (
             "focus the camera on the platform, add light to shorten the exposure, and clear the"
@@ -232,6 +233,7 @@ class MultiCameraCount:
 
 
 def track_cameras(
+    rig: Rig,
     streams: Mapping[str, Iterator[LoggedImage]],
     within: float,
     count: MultiCameraCount,
@@ -240,6 +242,7 @@ def track_cameras(
     """The fused pose of all cameras, by frame set, until the last source ends.
 
     Args:
+        rig: With these cameras.
         streams: Output of `track` for each camera, by the camera's name.
         within: Images farther than this from the median time of a frame set are not fused with the
             others, [s].
@@ -256,6 +259,7 @@ def track_cameras(
         CameraMoved: Frame tags are not at their expected positions.
     """
     poses, reason, common = 0, "the sources have no images", MultiCameraFusion(within)
+    exchanged: tuple[str, str] | None = None
     running = {name: _ignoring_no_platform(stream) for name, stream in streams.items()}
     for frame, images in enumerate(synchronize_frames(running, 2.0 * within)):
         alone = {name: replace(one, frame=frame) for name, one in images.items()}
@@ -267,15 +271,18 @@ def track_cameras(
             poses += 1
             clearance = clearance_of(model, found) if model is not None else None
         else:
-            reason = found.reason
+            reason, exchanged = found.reason, _exchanged(rig, alone)
         yield LoggedImage(next(iter(alone.values())).name, found, clearance, frame), alone
     count.clocks = common.clock_remarks()
     if not poses:
-        next_step = (
+        why, next_step = (
+            "; ".join(count.clocks),
             "check that the cameras see the platform; `cdpr track` with a single source gives"
-            " details"
+            " details",
         )
-        if DISAGREE in reason:
+        if exchanged is not None:
+            why, next_step = exchanged_sources(*exchanged)
+        elif DISAGREE in reason:
             next_step = (
                 "check that simultaneous images have the same name (in videos the same time), then"
                 " calibrate the cameras' poses again"
@@ -283,9 +290,23 @@ def track_cameras(
         raise NoPlatformSeen(
             f"no camera gives a platform pose: {reason}",
             where=f"cameras {', '.join(streams)}",
-            why="; ".join(count.clocks),
+            why=why,
             next_step=next_step,
         )
+
+
+def _exchanged(rig: Rig, seen: Mapping[str, LoggedImage]) -> tuple[str, str] | None:
+    """Two cameras whose poses of the platform agree only if their images are exchanged."""
+    found = {name: one.observation for name, one in seen.items()}
+    poses = {name: one.pose for name, one in found.items() if isinstance(one, PoseMeasurement)}
+    for a, b in combinations(poses, 2):
+        b_from_a = rig.camera(b).world_from_camera.compose(
+            rig.camera(a).world_from_camera.inverse()
+        )
+        by_b, by_a = b_from_a.compose(poses[a]), b_from_a.inverse().compose(poses[b])
+        if pose_gap(poses[a], poses[b]) > 1.0 >= pose_gap(by_a, by_b):
+            return a, b
+    return None
 
 
 def _ignoring_no_platform(stream: Iterator[LoggedImage]) -> Iterator[LoggedImage]:

@@ -278,7 +278,7 @@ class Tracker:
         in_other_image = before if number != self._pictures else None
         try:
             check = require_unmoved_camera(
-                self.camera, views, self._moved_px, in_other_image, self.rig.tag_family
+                self.camera, views, self._moved_px, in_other_image, self.rig
             )
         except CameraMoved as moved:
             if not are_mirrored(image, self._detector, (*self._frame, *self.expected_tags)):

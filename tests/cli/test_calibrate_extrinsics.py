@@ -86,7 +86,7 @@ def test_a_camera_is_found_by_frame_tags_and_the_result_used(folder, truth, tmp_
     (tmp_path / "one" / "0.png").write_bytes((folder / "0.png").read_bytes())
     log = tmp_path / "poses.csv"
     wrong = call("track", RIG, tmp_path / "one", "-o", log)
-    one_message(wrong, 2, "if the camera moved, restore it or calibrate its pose again")
+    one_message(wrong, 2, "take more images: the next one that shows the frame tags decides")
     second = tmp_path / "one" / "1.png"
     second.write_bytes((folder / "1.png").read_bytes())
     wrong = call("track", RIG, tmp_path / "one", "-o", log)

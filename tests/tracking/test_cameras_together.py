@@ -19,6 +19,8 @@ from simulation.camera.camera import Optics, SyntheticCamera
 from tests.tracking.test_tracker import error_of
 from tracking.fusion import UNSTATED_ERROR, MultiCameraFusion, fuse_poses
 from tracking.measurement import NoPose, Observation, PoseMeasurement, extrapolate
+from tracking.pose_log import LoggedImage
+from tracking.track import MultiCameraCount, NoPlatformSeen, track_cameras
 from tracking.tracker import Tracker
 
 HERE = Pose.level([0.05, 0.05, 0.4])
@@ -35,6 +37,10 @@ def other_side(camera: Camera) -> Camera:
 def measured(position: list[float], sigma: list[float]) -> PoseMeasurement:
     covariance = np.diag(np.square([*sigma, 1e-3, 1e-3, 1e-3]))
     return PoseMeasurement(0.0, Pose.level(position), covariance, (301,), 0.1, "tracked")
+
+
+def logged(found: Observation) -> LoggedImage:
+    return LoggedImage("0.png", found, None, 0)
 
 
 def without_shared(found: Observation) -> Observation:
@@ -205,6 +211,25 @@ def test_of_two_that_disagree_there_is_no_pose() -> None:
     found = fuse_poses({"front": a, "side": b})
     assert isinstance(found, NoPose)
     assert found.reason == "cameras front and side disagree by 10.0 mm"
+
+
+@pytest.mark.parametrize("exchange", [True, False])
+def test_two_that_agree_once_exchanged_are_not_to_be_calibrated_again(
+    rig: Rig, camera: Camera, exchange: bool
+) -> None:
+    pair = (camera, other_side(camera))
+    true = [camera.world_from_camera.inverse().compose(HERE) for camera in pair]
+    seen = [true[1], true[0]] if exchange else [true[0], moved(true[1], np.full(6, 0.1))]
+    streams = {
+        one.name: iter([logged(replace(measured([0.0] * 3, [1e-4] * 3), pose=pose))])
+        for one, view in zip(pair, seen, strict=True)
+        for pose in [one.world_from_camera.compose(view)]
+    }
+    tracked = track_cameras(replace(rig, cameras=pair), streams, 0.05, MultiCameraCount())
+    with pytest.raises(NoPlatformSeen, match="front and side disagree") as caught:
+        list(tracked)
+    assert ("exchange the sources" in caught.value.next_step) is exchange
+    assert ("calibrate the cameras' poses again" in caught.value.next_step) is not exchange
 
 
 def test_of_three_the_one_that_disagrees_is_left_out() -> None:

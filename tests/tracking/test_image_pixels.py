@@ -81,7 +81,7 @@ def fitted(camera: Camera, angle: float, hidden: int | None = None) -> tuple[Bun
 
 
 @pytest.mark.parametrize("angle", [*ANGLES, 80.0])
-def test_a_survey_error_is_as_large_off_the_axis_as_on_it(angle: float) -> None:
+def test_a_survey_error_is_as_large_off_the_axis_as_on_it(rig: Rig, angle: float) -> None:
     camera, pose = fisheye(), facing(angle, 2.0)
     tag, shift = Tag(id=1, size=0.15, pose=pose), 5e-4 * pose.rotation[:, 0]
     expected, seen = (pixels_of(camera, tag_corners(tag) + off) for off in (0.0, shift))
@@ -91,16 +91,16 @@ def test_a_survey_error_is_as_large_off_the_axis_as_on_it(angle: float) -> None:
     assert check.error == pytest.approx(0.075, rel=0.05)
     assert check.distance == pytest.approx(5e-4, rel=0.02)
     limit = TrackerSettings().camera_moved_px
-    require_unmoved_camera(camera, views, limit, check, "tag36h11")
+    require_unmoved_camera(camera, views, limit, check, rig)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
-def test_a_camera_that_moved_is_reported_with_its_error_in_the_image(angle: float) -> None:
+def test_a_moved_camera_is_reported_with_its_error_in_the_image(rig: Rig, angle: float) -> None:
     camera, pose = fisheye(), facing(angle, 2.0)
     tag, shift = Tag(id=1, size=0.15, pose=pose), 0.02 * pose.rotation[:, 0]
     views = [TagView(tag, square(camera, pixels_of(camera, tag_corners(tag) + shift)))]
     with pytest.raises(CameraMoved) as caught:
-        require_unmoved_camera(camera, views, 1.0, check_camera(camera, views), "tag36h11")
+        require_unmoved_camera(camera, views, 1.0, check_camera(camera, views), rig)
     assert isinstance(caught.value, Fault)
     assert caught.value.values["error_px"] == pytest.approx(3.0, rel=0.02)
     assert caught.value.values["error_mm"] == pytest.approx(20.0, rel=0.02)

@@ -152,6 +152,30 @@ def test_a_moved_camera_is_reported_with_the_distance(
     assert "world_from_camera" in caught.value.next_step
 
 
+@pytest.mark.parametrize(("shift_mm", "turn_deg"), [(0.0, 0.0), (20.0, 1.0), (80.0, 0.0)])
+def test_exchanged_sources_of_two_cameras_do_not_look_like_a_moved_camera(
+    rig: Rig, camera: Camera, scene: Scene, shift_mm: float, turn_deg: float
+) -> None:
+    quarter = matrix_from_rotation_vector([0.0, 0.0, np.pi / 2.0])
+    here = camera.world_from_camera
+    beside = Pose(quarter @ here.position, quarter @ here.rotation)
+    side = replace(camera, name="side", world_from_camera=beside)
+    turn = matrix_from_rotation_vector([0.0, 0.0, np.radians(turn_deg)])
+    off = Pose(beside.position + shift_mm / 1e3 * np.eye(3)[2], turn @ beside.rotation)
+    real = SyntheticCamera(rig, scene, replace(side, world_from_camera=off), seed=1)
+    tracker = Tracker(replace(rig, cameras=(camera, side)), camera)
+    images = [real.render(Pose.level([0.0, 0.0, 0.445]), k) for k in range(2)]
+    assert isinstance(tracker.observe(images[0], 0.0), NoPose)
+    with pytest.raises(CameraMoved) as caught:
+        tracker.observe(images[1], 0.1)
+    if shift_mm < 50.0:
+        assert "'front' are from the pose of camera 'side'" in caught.value.what
+        assert "exchange the sources" in caught.value.next_step
+        assert "do not calibrate" in caught.value.next_step
+    else:
+        assert "calibrate its pose again" in caught.value.next_step
+
+
 def test_mirrored_images_are_named_where_a_frame_tag_looks_alike_in_a_mirror(
     rig: Rig, camera: Camera, scene: Scene
 ) -> None:
