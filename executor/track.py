@@ -33,7 +33,7 @@ from model.files.reading import is_folder
 from model.pages.page import FactsDisplay
 from model.plan import Plan, require_same_rig
 from model.pose import Pose
-from model.progress import SILENT, Listener
+from model.progress import SILENT, Listener, skipped_files
 from model.rig import Camera, Rig
 from model.scene import Scene
 from planner.check import verify
@@ -213,13 +213,16 @@ def track_sources(
     result = TrackResult(
         by_camera={camera.name: [] for camera in sources} if several else {},
         together=MultiCameraCount() if several else None,
-        unused={camera.name: {} for camera in sources},
         with_clearance=model is not None,
     )
     opened = [
-        _opened(rig, the_scene, camera, source, plan, result.unused[camera.name], stopped, listener)
+        _opened(rig, the_scene, camera, source, plan, stopped, listener)
         for camera, source in sources.items()
     ]
+    result.unused = {
+        camera.name: frames.unused if isinstance(frames, ImageFolder) else {}
+        for camera, (frames, _) in zip(sources, opened, strict=True)
+    }
     opened, within = _simultaneous(list(sources), opened, listener)
     copies = [CopyCheck() for _ in opened]
     is_live = any(length is None for _, length in opened)  # then times are of the monotonic clock
@@ -248,6 +251,9 @@ def track_sources(
             if not result.count.pictures and stopped():
                 raise StoppedByOperator("stopped before the first image") from None
             raise
+        finally:
+            for text in skipped_files(result.unused_files()):
+                listener.remark(text)
     for text in result.together.clocks if result.together is not None else ():
         listener.remark(text)
     for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
@@ -399,7 +405,6 @@ def _opened(
     camera: Camera,
     source: str,
     plan: Plan | None,
-    unused: dict[str, str],
     stopped: Callable[[], bool],
     listener: Listener,
 ) -> tuple[Iterable[SourceImage], int | None]:
@@ -415,12 +420,7 @@ def _opened(
         return _rendered(rig, scene, camera, timed_poses), len(timed_poses)
     path = path_of(source)
     if is_folder(path):
-
-        def skipped(name: str, why: str) -> None:
-            unused[name] = why
-            listener.remark(f"skipped: {name} {why}")
-
-        folder = ImageFolder(path, camera, on_unused=skipped)
+        folder = ImageFolder(path, camera)
         return folder, len(folder)
     if path.is_file():
         video = VideoFile(path, camera)

@@ -103,6 +103,12 @@ def distinct_figures(values: Sequence[float], digits: int, kind: str = "f") -> l
     return texts
 
 
+def first_few(texts: Sequence[str], most: int = 3) -> str:
+    """The first of several texts, and the number of the others."""
+    rest = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + rest
+
+
 def _finite(value: object) -> object:
     """The value for JSON, which has no number for infinity."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

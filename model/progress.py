@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Protocol
+
+from model.errors import first_few
 
 
 class Advance(Protocol):
@@ -55,3 +58,15 @@ def _ignored(value: float, note: str = "", text: str = "") -> None:
 
 #: Ignores all reports.
 SILENT = Listener()
+
+
+def skipped_files(reasons: Mapping[str, str]) -> Iterator[str]:
+    """Remarks on files that are not used, one for each reason.
+
+    Args:
+        reasons: A verb with its complements, by name of the file.
+    """
+    for reason in dict.fromkeys(reasons.values()):
+        names = [name for name, one in reasons.items() if one == reason]
+        several = f"{len(names)} files ({first_few(names)}); each"
+        yield f"skipped: {names[0] if len(names) == 1 else several} {reason}"

@@ -46,7 +46,6 @@ class ImageFolder(FrameSource):
         folder: Folder of the images.
         camera: The camera that took them.
         rate: Images per second (default: the camera's).
-        on_unused: Called with name and reason for each file that is not used.
 
     Attributes:
         files: All files with an image suffix.
@@ -63,14 +62,12 @@ class ImageFolder(FrameSource):
         folder: Path,
         camera: Camera,
         rate: float | None = None,
-        on_unused: Callable[[str, str], None] | None = None,
     ) -> None:
         self.files = image_files(folder)
         self.names = tuple(image_name(path) for path in self.files)
         self.unused: dict[str, str] = {}
         self._folder, self._camera = folder, camera
         self.rate = rate or camera.rate
-        self._on_unused = on_unused or (lambda *_: None)
 
     def __len__(self) -> int:
         return len(self.files)
@@ -92,9 +89,9 @@ class ImageFolder(FrameSource):
                     self._camera.require_unrotated(str(path))
                 yield Frame(number / self.rate, image, name, number)
                 continue
-            why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
-            self.unused[name] = why
-            self._on_unused(name, why)
+            self.unused[name] = (
+                _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
+            )
         if none_read:
             raise _no_picture(self._folder, self.unused)
         if len(self.unused) == len(self.files):

@@ -161,11 +161,9 @@ def test_a_broken_file_among_good_ones_is_named_and_skipped(
 ) -> None:
     (folder / "frame_9.png").write_bytes(b"\x89PNG\r\n\x1a\n cut short")
     (folder / "frame_10.png").write_bytes(b"")
-    unused: dict[str, str] = {}
-    source = ImageFolder(folder, camera, on_unused=unused.__setitem__)
+    source = ImageFolder(folder, camera)
     results = list(track(source, Tracker(rig, camera)))
-    assert list(unused) == ["frame_9.png", "frame_10.png"]
-    assert unused == source.unused
+    assert list(source.unused) == ["frame_9.png", "frame_10.png"]
     assert [r.name for r in results] == ["frame_8.png", "frame_11.png"]
     for result, truth in zip(results, (TRUTH[0], TRUTH[3]), strict=True):
         assert isinstance(result.observation, PoseMeasurement)
@@ -307,10 +305,9 @@ def test_a_picture_of_another_size_among_good_ones_is_named_and_skipped(
     folder: Path, camera: Camera
 ) -> None:
     cv2.imwrite(str(folder / "frame_9.png"), np.zeros((480, 640), dtype=np.uint8))
-    unused: dict[str, str] = {}
-    source = ImageFolder(folder, camera, on_unused=unused.__setitem__)
+    source = ImageFolder(folder, camera)
     assert [frame.name for frame in source] == ["frame_8.png", "frame_10.png", "frame_11.png"]
-    assert unused == {"frame_9.png": "has 640 x 480 px, the camera has 1280 x 720 px"}
+    assert source.unused == {"frame_9.png": "has 640 x 480 px, the camera has 1280 x 720 px"}
 
 
 def test_pictures_that_are_all_of_another_size_are_refused_by_name(

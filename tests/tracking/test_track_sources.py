@@ -239,8 +239,12 @@ def test_an_error_before_the_first_frame_set_keeps_what_was_written(
         cv2.imwrite(str(tmp_path / "side" / name), small)
     kept: list[object] = []
     with pytest.raises(BadInput):
-        track_sources(rig, sources, keep=kept.append)
+        track_sources(rig, sources, keep=kept.append, listener=(remarks := Remarks()))
     assert kept == []
+    assert remarks.texts == [
+        "skipped: 3 files (side/0.png, side/1.png, side/2.png); each has 64 x 48 px, the camera has"
+        " 1280 x 720 px"
+    ]
 
 
 def test_images_missing_in_all_folders_are_remarked_on(
