@@ -11,6 +11,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import ConfigDict, Field
 
+from model.errors import first_few
 from model.files.documents import (
     Document,
     Finding,
@@ -28,9 +29,7 @@ from model.files.documents import (
 )
 from model.pose import Array, RotationLimits
 
-# The payload of the platform, and its changes at picks and places.
-#
-# In the units of the scene file.
+# The payload of the platform, and its changes at picks and places, in units of the scene file.
 
 
 NOTHING_KG = 1e-9
@@ -336,18 +335,18 @@ class SceneDocument(Document):
 
     def remarks(self) -> list[str]:
         """Values that are valid but unlikely, such as metres for millimetres, each with its key."""
-        clearance = self.clearance.model_dump()
         small = [
             f"obstacles[{i}]: {obstacle.name!r} is {size:g} mm large"
             for i, obstacle in enumerate(self.obstacles)
             if (size := _extent(obstacle)) < SMALL_OBSTACLE_MM
         ]
-        small += [
+        tight = [
             f"clearance.{key}: {value:g} mm is very small"
-            for key, value in clearance.items()
+            for key, value in self.clearance.model_dump().items()
             if 0.0 < value < SMALL_CLEARANCE_MM
         ]
-        return [f"{what}; check that it is in mm, not in m" for what in small]
+        merged = [first_few(small)] if small else []
+        return [f"{what}; check that it is in mm, not in m" for what in merged + tight]
 
     def _one_shape_each(self) -> list[Finding]:
         found: list[Finding] = []

@@ -319,6 +319,14 @@ def test_obstacles_in_metres_get_a_remark(shape: dict[str, Any]) -> None:
     assert remark.endswith("check that it is in mm, not in m")
 
 
+def test_many_obstacles_in_metres_get_one_remark() -> None:
+    data = scene_data()
+    data["obstacles"] = [{"name": f"pin{k}", "sphere": {"radius_mm": 0.2}} for k in range(40)]
+    [remark] = scene_of(data).document.remarks()
+    assert remark.startswith("obstacles[0]: 'pin0' is 0.4 mm large, obstacles[1]: 'pin1' is 0.4 mm")
+    assert remark.endswith("'pin2' is 0.4 mm large and 37 more; check that it is in mm, not in m")
+
+
 @pytest.mark.parametrize("key", ["obstacle_mm", "self_mm"])
 @pytest.mark.parametrize(("value", "count"), [(0, 0), (0.04, 1), (1, 0)])
 def test_a_clearance_in_metres_gets_a_remark(key: str, value: float, count: int) -> None:
