@@ -39,11 +39,11 @@ def open_camera(
     require_types((rig, Rig))
     taken_by, path = rig.camera(camera), path_of(str(source))
     if is_folder(path):
-        return ImageFolder(path, taken_by)
+        return ImageFolder(path, taken_by, cameras=rig.cameras)
     if path.is_file():
-        return VideoFile(path, taken_by)
+        return VideoFile(path, taken_by, cameras=rig.cameras)
     require_camera_source(str(source))
-    return LiveCamera(str(source), taken_by)
+    return LiveCamera(str(source), taken_by, cameras=rig.cameras)
 
 
 def track(

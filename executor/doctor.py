@@ -251,7 +251,7 @@ def _camera(rig: Rig, camera: Camera, source: str) -> MachineCheck:
 
     name = f"camera {camera.name}"
     try:
-        LiveCamera(source, camera, needs_times=False).close()
+        LiveCamera(source, camera, needs_times=False, cameras=rig.cameras).close()
     except CdprError as error:
         return MachineCheck(name, False, error.what, error.next_step)
     size = f"{camera.width} x {camera.height} px"

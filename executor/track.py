@@ -420,15 +420,15 @@ def _opened(
         return _rendered(rig, scene, camera, timed_poses), len(timed_poses)
     path = path_of(source)
     if is_folder(path):
-        folder = ImageFolder(path, camera)
+        folder = ImageFolder(path, camera, cameras=rig.cameras)
         return folder, len(folder)
     if path.is_file():
-        video = VideoFile(path, camera)
+        video = VideoFile(path, camera, cameras=rig.cameras)
         if video.remark:
             listener.remark(video.remark)
         return video, len(video)
     require_camera_source(source)
-    return LiveCamera(source, camera, stopped=stopped), None
+    return LiveCamera(source, camera, stopped=stopped, cameras=rig.cameras), None
 
 
 def _poses_in_time(rig: Rig, camera: Camera, plan: Plan) -> list[tuple[float, Pose]]:

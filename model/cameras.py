@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, TypeVar, runtime_checkable
 
@@ -150,6 +150,29 @@ def exchanged_sources(name: str, other: str) -> tuple[str, str]:
         f"exchange the sources of cameras {name!r} and {other!r} (a single source is named"
         f" {other}=SOURCE), and do not calibrate them again",
     )
+
+
+OTHER_SIZE = (
+    "the images are from another camera, or were cropped or scaled",
+    "use full-size images of this camera, or calibrate it at this size",
+)
+"""Cause and next step where images are not of a camera's size."""
+
+
+def cause_of_size(
+    camera: Camera, sizes: Collection[tuple[int, int]], cameras: Iterable[Camera]
+) -> tuple[str, str]:
+    """The same, for images that may be those of another camera.
+
+    Args:
+        camera: The camera that should have taken them.
+        sizes: Widths and heights of the images, [px].
+        cameras: Of the rig.
+    """
+    for other in cameras:
+        if (other.width, other.height) in sizes:
+            return exchanged_sources(camera.name, other.name)
+    return OTHER_SIZE
 
 
 def camera_from(document: CameraDocument) -> Camera:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.live import Frame, FrameSource, Image, eight_bits
+from model.cameras import OTHER_SIZE, cause_of_size
 from model.errors import AlreadyExists, BadInput, CdprError, Fault
 from model.files.documents import write_bytes_atomic
 from model.files.reading import (
@@ -46,6 +47,7 @@ class ImageFolder(FrameSource):
         folder: Folder of the images.
         camera: The camera that took them.
         rate: Images per second (default: the camera's).
+        cameras: Of the rig, to name the one whose images these seem to be.
 
     Attributes:
         files: All files with an image suffix.
@@ -62,11 +64,12 @@ class ImageFolder(FrameSource):
         folder: Path,
         camera: Camera,
         rate: float | None = None,
+        cameras: Sequence[Camera] = (),
     ) -> None:
         self.files = image_files(folder)
         self.names = tuple(image_name(path) for path in self.files)
         self.unused: dict[str, str] = {}
-        self._folder, self._camera = folder, camera
+        self._folder, self._camera, self._cameras = folder, camera, cameras
         self.rate = rate or camera.rate
 
     def __len__(self) -> int:
@@ -79,23 +82,22 @@ class ImageFolder(FrameSource):
             BadInput: None can be read or has the camera's size, or as `Camera.require_unrotated`.
         """
         self.unused.clear()
-        wanted = (self._camera.width, self._camera.height)
-        none_read = True
+        wanted, sizes = (self._camera.width, self._camera.height), set[tuple[int, int]]()
         for number, (name, path) in enumerate(zip(self.names, self.files, strict=True)):
             image, is_rotated = _read(path, wanted)
-            none_read &= image is None
+            sizes.add(_size(image))
             if image is not None and _size(image) == wanted:
                 if is_rotated:
                     self._camera.require_unrotated(str(path))
                 yield Frame(number / self.rate, image, name, number)
                 continue
-            self.unused[name] = (
-                _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
-            )
-        if none_read:
+            why = _unreadable(path) if image is None else _other_size(_size(image), _CAMERA, wanted)
+            self.unused[name] = why
+        if sizes == {_size(None)}:
             raise _no_picture(self._folder, self.unused)
-        if len(self.unused) == len(self.files):
-            raise _wrong_sizes(self._folder, self.unused, wanted)
+        if wanted not in sizes:
+            cause = cause_of_size(self._camera, sizes, self._cameras)
+            raise _wrong_sizes(self._folder, self.unused, wanted, cause)
 
 
 class SingleCameraImages:
@@ -139,7 +141,7 @@ class SingleCameraImages:
         named = {image_name(path): path for path in sizes}
         self._files = {name: path for name, path in named.items() if name not in self.unused}
         if not self._files:
-            raise _wrong_sizes(folder, self.unused, self.size)
+            raise _wrong_sizes(folder, self.unused, self.size, OTHER_SIZE)
         self.names = tuple(self._files)
 
     def __iter__(self) -> Iterator[tuple[str, Image]]:
@@ -273,12 +275,14 @@ def _no_picture(folder: Path, unused: Mapping[str, str]) -> BadInput:
     )
 
 
-def _wrong_sizes(folder: Path, unused: dict[str, str], wanted: tuple[int, int]) -> BadInput:
+def _wrong_sizes(
+    folder: Path, unused: dict[str, str], wanted: tuple[int, int], cause: tuple[str, str]
+) -> BadInput:
     return BadInput(
         f"none of the {len(unused)} images has the camera's {wanted[0]} x {wanted[1]} px",
         where=str(folder),
-        why=_first(unused),
-        next_step="use full-size images of this camera, or calibrate it at this size",
+        why=f"{_first(unused)}: {cause[0]}",
+        next_step=cause[1],
     )
 
 

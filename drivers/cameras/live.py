@@ -6,7 +6,7 @@ import os
 import re
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +25,7 @@ from drivers.cameras.frame_reader import (
     FrameReader,
     silent_opencv,
 )
+from model.cameras import cause_of_size
 from model.errors import (
     BadInput,
     Fault,
@@ -85,6 +86,7 @@ class VideoFile(FrameSource):
         path: The file.
         camera: The camera that took it.
         rate: Images per second of a file that states no times (default: the camera's), [Hz].
+        cameras: Of the rig, to name the one whose images these seem to be.
 
     Attributes:
         rate: Images per second that the file states (default: as given), [Hz].
@@ -97,10 +99,16 @@ class VideoFile(FrameSource):
             for a file that states its times.
     """
 
-    def __init__(self, path: Path, camera: Camera, rate: float | None = None) -> None:
+    def __init__(
+        self,
+        path: Path,
+        camera: Camera,
+        rate: float | None = None,
+        cameras: Sequence[Camera] = (),
+    ) -> None:
         if not path.is_file():
             raise BadInput("no such file", where=str(path), next_step="check the path")
-        self._path, self._camera = path, camera
+        self._path, self._camera, self._cameras = path, camera, cameras
         if path.suffix.lower() in (".tif", ".tiff"):
             require_one_page(path)
         capture = _opened_video(path, camera)
@@ -171,7 +179,7 @@ class VideoFile(FrameSource):
                 image = _grey(np.asarray(picture))
                 stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
                 if number == 0:
-                    refuse_wrong_size(image, self._camera, str(self._path))
+                    refuse_wrong_size(image, self._camera, str(self._path), self._cameras)
                     begin = stated if np.isfinite(stated) else 0.0  # not always 0
                 shown = stated - begin
                 is_later = self._has_times and np.isfinite(shown) and shown > seconds
@@ -197,6 +205,7 @@ class LiveCamera(FrameSource):
         stopped: Ends the images when true; called repeatedly while there is none.
         needs_times: Skips images whose times are unknown, as they may have waited; False for images
             of something at rest.
+        cameras: Of the rig, to name the one whose images these seem to be.
 
     Raises:
         HardwareMissing: It does not open or delivers no image.
@@ -212,9 +221,10 @@ class LiveCamera(FrameSource):
         stopped: Callable[[], bool] = lambda: False,
         *,
         needs_times: bool = True,
+        cameras: Sequence[Camera] = (),
     ) -> None:
         self.name = f"camera {live_name(camera.name, str(source))}"
-        self._stopped, self._seen, self._camera = stopped, 0, camera
+        self._stopped, self._seen, self._camera, self._cameras = stopped, 0, camera, cameras
         self._is_address = "://" in str(source)
         numbered = isinstance(source, int) or source.isdecimal()
         if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
@@ -262,7 +272,7 @@ class LiveCamera(FrameSource):
         if arrived is not None:
             self._seen += 1
             number, image = arrived.number, _grey(arrived.picture)
-            refuse_wrong_size(image, self._camera, self.name)
+            refuse_wrong_size(image, self._camera, self.name, self._cameras)
             return Frame(arrived.time - self._camera.latency, image, f"image {number}", number)
         if self._stopped():
             what = "stopped before the camera delivered an image"
@@ -347,20 +357,26 @@ def live_name(camera: str, source: str) -> str:
     return shown if camera == source else f"{camera} ({shown})"
 
 
-def refuse_wrong_size(image: Image, camera: Camera, where: str) -> None:
+def refuse_wrong_size(
+    image: Image, camera: Camera, where: str, cameras: Sequence[Camera] = ()
+) -> None:
     """Refuses an image that has not the size for which the camera was calibrated.
+
+    Args:
+        cameras: Of the rig, to name the one whose image it seems to be.
 
     Raises:
         BadInput: The size differs.
     """
     height, width = image.shape
     if (width, height) != (camera.width, camera.height):
+        why, next_step = cause_of_size(camera, [(width, height)], cameras)
         raise BadInput(
             f"the image has {width} x {height} px, camera {camera.name!r} has {camera.width} x"
             f" {camera.height} px",
             where=where,
-            why="the image is from another camera, or was cropped or scaled",
-            next_step="use full-size images of this camera, or calibrate it at this size",
+            why=why,
+            next_step=next_step,
         )
 
 

@@ -154,7 +154,7 @@ def _source(rig: Rig, scene: Scene, camera: Camera, name: str) -> ImageSource:
         synthetic = make_synthetic_camera(rig, scene, camera)
         true = synthetic.camera.latency
         return RenderedImages(ImageSequence(synthetic), camera.latency, true)
-    return LiveImages(LiveCamera(name, camera))
+    return LiveImages(LiveCamera(name, camera, cameras=rig.cameras))
 
 
 class RenderedImages:

@@ -16,7 +16,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from calibration.images import open_source
-from drivers.cameras.files import ImageFolder, SingleCameraImages, image_files
+from drivers.cameras.files import ImageFolder, ImageOutput, SingleCameraImages, image_files
 from drivers.cameras.live import Frame, LiveCamera, VideoFile, video_size
 from executor.cameras.sources import first_gap
 from model.errors import BadInput, HardwareMissing
@@ -308,6 +308,22 @@ def test_a_picture_of_another_size_among_good_ones_is_named_and_skipped(
     source = ImageFolder(folder, camera)
     assert [frame.name for frame in source] == ["frame_8.png", "frame_10.png", "frame_11.png"]
     assert source.unused == {"frame_9.png": "has 640 x 480 px, the camera has 1280 x 720 px"}
+
+
+@pytest.mark.parametrize("name", ["pictures", "a.avi"])
+@pytest.mark.parametrize("is_small", [False, True])
+def test_images_of_the_size_of_another_camera_are_named_as_its_own(
+    tmp_path: Path, camera: Camera, name: str, is_small: bool
+) -> None:
+    small = replace(camera, name="side", width=64 if is_small else 66, height=48)
+    with ImageOutput(tmp_path / name, 10.0) as out:
+        out.write(np.zeros((48, 64, 3), np.uint8), "a.png")
+    source = VideoFile if name == "a.avi" else ImageFolder
+    with pytest.raises(BadInput) as caught:
+        list(source(tmp_path / name, camera, cameras=(camera, small)))
+    assert ("'front' seems to be that of 'side'" in caught.value.why) is is_small
+    assert ("do not calibrate" in caught.value.next_step) is is_small
+    assert ("calibrate it at this size" in caught.value.next_step) is not is_small
 
 
 def test_pictures_that_are_all_of_another_size_are_refused_by_name(

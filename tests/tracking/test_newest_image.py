@@ -257,8 +257,10 @@ def test_a_camera_without_images_or_of_another_size_is_released(
     monkeypatch.setattr(queue, "released", False)
     monkeypatch.setattr(queue, "_shape", (4, 5, 3))
     queue.take(OPENING)
-    with pytest.raises(BadInput, match="5 x 4 px"):
-        LiveCamera("0", camera, queue.clock)
+    small = replace(camera, name="side", width=5, height=4)
+    with pytest.raises(BadInput, match="5 x 4 px") as caught:
+        LiveCamera("0", camera, queue.clock, cameras=(camera, small))
+    assert "exchange the sources of cameras 'front' and 'side'" in caught.value.next_step
     assert queue.released
 
 
