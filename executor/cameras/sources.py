@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -249,8 +250,17 @@ def _require_own(address: str, chosen: Mapping[Camera, str], name: str, where: s
 
 
 def _device(source: str) -> str:
-    """Canonical name of a source: ``0`` and ``/dev/video0`` are the same camera."""
-    return source.removeprefix("/dev/video")
+    """Canonical name of a source: ``00`` and ``/dev/video0`` are the same, and a path's links."""
+    if "://" in source:
+        kind, _, rest = source.partition("://")
+        server, sign, path = rest.partition("/")
+        user, at, host = server.rpartition("@")
+        return f"{kind.lower()}://{user}{at}{host.lower()}{sign or '/'}{path}"
+    with suppress(OSError, RuntimeError, ValueError):  # such as a loop of links, or a null byte
+        if source.isdecimal() and not Path(source).exists():
+            source = f"/dev/video{source.lstrip('0') or '0'}"
+        return str(Path(source).resolve())
+    return source
 
 
 def require_camera_source(source: str) -> None:

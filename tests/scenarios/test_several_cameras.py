@@ -21,7 +21,7 @@ from executor import evaluation as run_module
 from executor.cameras import client as camera_sight
 from executor.cameras import multi_camera as run_cameras
 from executor.cameras import process as camera_process
-from executor.cameras.sources import choose_cameras, resolve_cameras
+from executor.cameras.sources import choose_cameras, parse_camera_sources, resolve_cameras
 from executor.homing import home
 from executor.realtime.scheduling import SimulatedClock
 from executor.recording.run_folder import RunFolder
@@ -204,6 +204,56 @@ def test_cameras_that_are_not_named_clearly_are_refused(
     with nothing_written(tmp_path):
         answer = call("run", plan, "--rig", rig_file, "-o", tmp_path / "run", *wanted)
     one_message(answer, 2, *parts)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("0", "00"),
+        ("/dev/video0", "000"),
+        ("dir", "dir/"),
+        ("dir", "./dir"),
+        ("dir", "../{here}/dir"),
+        ("dir", "{root}/dir"),
+        ("dir", "link"),
+        ("{root}/link", "dir/../dir"),
+        ("7", "{root}/7"),  # a folder
+        ("http://camera.lan/video", "HTTP://Camera.LAN/video"),
+        ("rtsp://Me:Pass@host", "rtsp://Me:Pass@HOST/"),
+    ],
+)
+def test_the_same_source_in_other_words_is_refused(
+    rig_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one: str, other: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "dir").mkdir()
+    (tmp_path / "7").mkdir()
+    (tmp_path / "link").symlink_to("dir")
+    names = {"root": tmp_path, "here": tmp_path.name}
+    sources = [f"side={one.format(**names)}", f"front={other.format(**names)}"]
+    with pytest.raises(BadInput, match="have the same source"):
+        parse_camera_sources(load_rig(rig_file), sources, None)
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("0", "10"),
+        ("0", "dir"),
+        ("dir", "dir2"),
+        ("http://host/Video", "http://host/video"),
+        ("rtsp://me:A@host/", "rtsp://me:a@host/"),
+        ("null\0byte", "0" * 5000),
+        ("loop", "0"),
+    ],
+)
+def test_different_sources_are_accepted(
+    rig_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, one: str, other: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to("loop")
+    sources = [f"side={one}", f"front={other}"]
+    assert len(parse_camera_sources(load_rig(rig_file), sources, None)) == 2
 
 
 @pytest.fixture
