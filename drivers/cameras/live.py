@@ -25,20 +25,16 @@ from drivers.cameras.frame_reader import (
     FrameReader,
     silent_opencv,
 )
-from model.cameras import cause_of_size
-from model.errors import (
-    BadInput,
-    Fault,
-    HardwareMissing,
-    StoppedByOperator,
-    without_passwords,
-)
+from model.cameras import Camera, cause_of_size
+from model.errors import BadInput, Fault, HardwareMissing, StoppedByOperator, without_passwords
 from model.files.reading import MOST_PIXELS, require_one_page
-from model.rig import Camera
 
 Image = NDArray[np.uint8]
 LAST_CAMERA = 255
 """Largest camera index on Linux; OpenCV takes larger numbers as ports of other drivers."""
+
+ADDRESSES = ("http", "https", "rtsp", "rtsps", "rtmp", "rtmps", "rtp", "srt", "tcp", "udp")
+"""Kinds of address at which FFmpeg, with which OpenCV reads them, can find a video."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -227,12 +223,7 @@ class LiveCamera(FrameSource):
         self._stopped, self._seen, self._camera, self._cameras = stopped, 0, camera, cameras
         self._is_address = "://" in str(source)
         numbered = isinstance(source, int) or source.isdecimal()
-        if numbered and (len(str(source)) > 9 or int(source) > LAST_CAMERA):
-            raise BadInput(
-                f"there is no camera with index {str(source)[:40]}",
-                where=self.name[:100],
-                next_step=f"give an index from 0 to {LAST_CAMERA}; `ls /dev/video*` lists them",
-            )
+        _require_possible(str(source), self.name[:100])
 
         def opened() -> cv2.VideoCapture:
             capture = _opened(int(source) if numbered else str(source))
@@ -297,6 +288,24 @@ class LiveCamera(FrameSource):
         self._finalizer()
 
 
+def _require_possible(source: str, where: str) -> None:
+    """Refuses an index or an address that no camera can have."""
+    kind, is_address, rest = source.partition("://")
+    port = re.match(r"[^/?#]*:(\d+)(?![^/?#])", rest)
+    if source.isdecimal() and (len(source) > 9 or int(source) > LAST_CAMERA):
+        what = f"there is no camera with index {source[:40]}"
+        next_step = f"give an index from 0 to {LAST_CAMERA}; `ls /dev/video*` lists them"
+    elif is_address and kind.lower() not in ADDRESSES:
+        what = f"no camera has an address that begins with {kind[:40]}://"
+        known = f"{', '.join(ADDRESSES[:-1])} or {ADDRESSES[-1]}"
+        next_step = f"take the address from the camera's manual: it begins with {known}"
+    elif port is not None and not 0 < int(port[1][:9]) <= 65535:
+        what, next_step = "the address has a port that does not exist", "give one from 1 to 65535"
+    else:
+        return
+    raise BadInput(what, where=where, next_step=next_step)
+
+
 def _likely_cause(lost: str, is_address: bool, seen: int) -> tuple[str, str]:
     """Why a camera may deliver no images, and the next step.
 
@@ -357,9 +366,7 @@ def live_name(camera: str, source: str) -> str:
     return shown if camera == source else f"{camera} ({shown})"
 
 
-def refuse_wrong_size(
-    image: Image, camera: Camera, where: str, cameras: Sequence[Camera] = ()
-) -> None:
+def refuse_wrong_size(image: Image, camera: Camera, where: str, cameras: Sequence[Camera]) -> None:
     """Refuses an image that has not the size for which the camera was calibrated.
 
     Args:

@@ -478,6 +478,47 @@ def test_a_camera_that_is_not_there_is_hardware_missing(camera: Camera) -> None:
     assert caught.value.where == "camera front (97)"
 
 
+@pytest.mark.parametrize(
+    ("source", "what"),
+    [
+        ("gopher://camera/video", "no camera has an address that begins with gopher://"),
+        ("file:///tmp/run.avi", "begins with file://"),
+        ("htp://camera:80", "begins with htp://"),
+        ("://camera", "begins with ://"),
+        ("http://camera:99999/video", "the address has a port that does not exist"),
+        ("RTSP://me:pass@camera:0", "a port that does not exist"),
+        ("rtsp://[::1]:65536?x", "a port that does not exist"),
+        ("udp://camera:" + "9" * 5000, "a port that does not exist"),
+    ],
+)
+def test_an_address_that_no_camera_can_have_is_refused(
+    camera: Camera, monkeypatch: pytest.MonkeyPatch, source: str, what: str
+) -> None:
+    monkeypatch.setattr("drivers.cameras.live._opened", pytest.fail)
+    with pytest.raises(BadInput) as caught:
+        LiveCamera(source, camera)
+    assert what in caught.value.what
+    assert "rtsp" in caught.value.next_step or "from 1 to 65535" in caught.value.next_step
+    assert "pass@" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "http://camera",
+        "rtsp://99999@[fe80::1]/x",
+        "HTTPS://me:99999@camera:65535/a:0?b:0",
+        "udp://@:1",
+    ],
+)
+def test_an_address_that_a_camera_can_have_is_opened(
+    camera: Camera, monkeypatch: pytest.MonkeyPatch, source: str
+) -> None:
+    monkeypatch.setattr("drivers.cameras.live._opened", lambda _: cv2.VideoCapture())
+    with pytest.raises(HardwareMissing, match="cannot be opened"):
+        LiveCamera(source, camera)
+
+
 def test_pictures_without_tags_say_what_was_expected(rig: Rig, camera: Camera) -> None:
     blank = [Frame(k * 0.1, np.full((720, 1280), 90, np.uint8), f"p{k}") for k in range(3)]
     seen = track(blank, Tracker(rig, camera))
