@@ -43,6 +43,8 @@ def track(
 ) -> None:
     """Measure the platform's pose from its tags, image by image.
 
+    Several live cameras are read in turn, at the pace of the slowest.
+
     Examples:
       cdpr track rig.yaml pictures/ -o poses.csv
       cdpr track rig.yaml 0 -o poses.csv --scene scene.yaml --pictures 100
