@@ -182,6 +182,8 @@ def _nothing_seen(
             "rotate the platform back; if it is not rotated so far, check rotation_wxyz of"
             " tags.platform and platform.home in the rig file"
         )
+        if len(tracker.rig.cameras) > 1:
+            next_step += ", and that the source is not that of another camera"
     elif len(mine) > 1:
         next_step = "check size_mm, position_mm and rotation_wxyz of tags.platform in the rig file"
         rotated = _rotated_tags(tracker, last)
@@ -277,8 +279,8 @@ def track_cameras(
     if not poses:
         why, next_step = (
             "; ".join(count.clocks),
-            "check that the cameras see the platform; `cdpr track` with a single source gives"
-            " details",
+            "check that each camera has its own source and sees the platform; `cdpr track` with a"
+            " single source gives details",
         )
         if exchanged is not None:
             why, next_step = exchanged_sources(*exchanged)

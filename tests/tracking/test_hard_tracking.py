@@ -113,6 +113,11 @@ def test_a_platform_rotated_too_far_is_named_with_its_angle_and_the_limit(
     with pytest.raises(NoPlatformSeen) as caught:
         list(track([Frame(0.0, image, "rotated")], Tracker(rig, narrow)))
     assert caught.value.next_step.startswith("rotate the platform back")
+    assert "another camera" not in caught.value.next_step
+    several = replace(rig, cameras=(narrow, replace(narrow, name="side")))
+    with pytest.raises(NoPlatformSeen, match="from the home pose") as caught:
+        list(track([Frame(0.0, image, "rotated")], Tracker(several, narrow)))
+    assert caught.value.next_step.endswith("the source is not that of another camera")
 
 
 @pytest.mark.parametrize("height", [0.30, 0.34, 0.37])
