@@ -25,6 +25,7 @@ from executor.cameras.sources import (
     require_plan_used,
 )
 from executor.kernels import ready_to_measure
+from executor.recording.clearance import source_of
 from executor.recording.mcap import write_track_mcap
 from executor.trajectory.setpoints import prepare
 from model.clearance import ClearanceModel
@@ -119,7 +120,7 @@ class TrackResult(FactsDisplay):
         if common:
             facts["common_deviation_mm"] = _median(common, 1000, 4)
         # Cameras that contradict each other have no fused pose, but one of them may be right.
-        sources = [("fused", logged), *self.by_camera.items()]
+        sources = [("tag", logged), *((source_of(n), of) for n, of in self.by_camera.items())]
         clearances = [(p.clearance, name) for name, of in sources for p in of if p.clearance]
         if clearances:
             nearest, source = min(clearances, key=lambda c: c[0].distance)

@@ -202,7 +202,7 @@ def test_an_image_that_a_camera_lost_shifts_none_of_its_others(
         assert found.pose.distance_to(pose) < 1e-3
 
 
-@pytest.mark.parametrize(("ahead", "source"), [(0.0, None), (0.1, "side")])
+@pytest.mark.parametrize(("ahead", "source"), [(0.0, None), (0.1, "tag:side")])
 def test_a_clearance_that_one_camera_alone_measures_counts(
     rig: Rig, scene: Scene, tmp_path: Path, ahead: float, source: str | None
 ) -> None:
@@ -219,13 +219,16 @@ def test_a_clearance_that_one_camera_alone_measures_counts(
     facts = result.summary()
     least = {
         name: min(1e3 * one.clearance.distance for one in images if one.clearance)
-        for name, images in {"fused": result.pictures, **result.by_camera}.items()
+        for name, images in [
+            ("tag", result.pictures),
+            *((f"tag:{camera}", alone) for camera, alone in result.by_camera.items()),
+        ]
     }
     assert facts["smallest_clearance_mm"] == pytest.approx(min(least.values()), abs=1e-3)
     assert facts["clearance_source"] == min(least, key=lambda name: least[name])
     if source is not None:
         assert facts["clearance_source"] == source
-        assert least[source] < least["fused"] - 20.0
+        assert least[source] < least["tag"] - 20.0
 
 
 def test_an_error_before_the_first_frame_set_keeps_what_was_written(
