@@ -140,18 +140,21 @@ def plan(
 
 
 def _least_rounds(document: PlanDocument) -> list[tuple[str, str]]:
-    """One line where the budget was spent before the least number of rounds was done."""
+    """One line where the budget of a leg was spent before the least number of rounds was done."""
     planner, spent = document.planner, (document.statistics.search_time_s or 0.0) * 1e3
     if not isinstance(planner, OptimalPlannerDocument) or planner.budget_ms is None:
         return []
-    legs = len(planner.rounds)
     least = least_rounds(
         has_limit=planner.longest_mm is not None,
         has_clearance=planner.name == "optimal" and planner.weights.clearance > 0.0,
     )
-    if min(planner.rounds) > least or spent < planner.budget_ms * legs:
+    # Fewer rounds are a straight line, found at once, unless every edge needs a proof.
+    legs = [rounds for rounds in planner.rounds if rounds >= least] or planner.rounds
+    scarce = sum(rounds <= least for rounds in legs)
+    in_them = spent - planner.budget_ms * (len(legs) - scarce)
+    if scarce == 0 or in_them < planner.budget_ms * scarce:
         return []
-    wanted = math.ceil(spent / legs / 10.0) * 100
+    wanted = math.ceil(in_them / scarce / 10.0) * 100
     return [("rounds", f"only the minimum; --budget-ms {wanted} allows about ten times as many")]
 
 

@@ -9,6 +9,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from cdpr.cli.plan import _least_rounds
+from model.files.plan_file import (
+    OptimalPlannerDocument,
+    PlanDocument,
+    StatisticsDocument,
+    WeightsDocument,
+)
 from tests.cli.plans import CONFIGS, RIG
 from tests.cli.program import call, nothing_written, one_message
 
@@ -86,6 +93,36 @@ def test_a_budget_that_only_the_least_rounds_exceed_is_reported(tmp_path: Path) 
         assert answer.code == 0, answer
         assert "only the minimum" not in answer.said
     assert json.loads((tmp_path / "a.json").read_text())["planner"]["rounds"] == [12]
+
+
+@pytest.mark.parametrize(
+    ("rounds", "spent_ms", "wanted_ms"),
+    [
+        ([12], 90.0, 900),
+        ([3], 90.0, 900),  # every edge needs a proof
+        ([12], 49.0, None),
+        ([1], 0.1, None),
+        ([1, 12, 1], 90.1, 1000),  # between straight legs
+        ([12, 400], 140.0, 900),
+        ([12, 400, 12], 230.0, 900),
+        ([1, 400], 50.1, None),
+        ([300, 400], 100.2, None),
+    ],
+)
+def test_the_least_rounds_are_reported_by_leg(
+    rounds: list[int], spent_ms: float, wanted_ms: int | None
+) -> None:
+    weights = WeightsDocument(length=1.0, kinematic=0.0, clearance=0.0, capacity=0.0)
+    planner = OptimalPlannerDocument(
+        name="optimal", weights=weights, seed=0, rounds=rounds, budget_ms=50.0, longest_mm=None
+    )
+    effort = StatisticsDocument(
+        nodes=1, iterations=1, edge_checks=1, planning_time_s=1.0, search_time_s=spent_ms / 1e3
+    )
+    said = _least_rounds(PlanDocument.model_construct(planner=planner, statistics=effort))
+    assert bool(said) == (wanted_ms is not None)
+    if said:
+        assert f"--budget-ms {wanted_ms} " in said[0][1]
 
 
 def test_positions_of_options_keep_the_orientations_of_the_scene(tmp_path: Path) -> None:
