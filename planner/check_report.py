@@ -108,7 +108,8 @@ class CheckReport:
         required_self_clearance: [m].
         min_tension: Smallest working tension at samples, [N]; NaN where there are none.
         max_tension: Largest working tension at samples, [N]; NaN where there are none.
-        capacity_margin: The smallest at samples, [N].
+        capacity_margin: The smallest at samples, [N]; of a path with stops, of the leg whose proved
+            margin exceeds the required one least, as are the next two.
         proved_capacity_margin: [N].
         required_capacity_margin: Largest wrench that accelerates the platform, [N].
         max_cable_speed: At the rig's path speed, at samples, [m/s].
@@ -294,6 +295,8 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
         for r, begin in zip(reports, begins, strict=False)
         if r.obstacle_clearance is not None
     ]
+    # What acceleration requires depends on the load, so it differs from leg to leg.
+    tightest = min(reports, key=lambda r: r.proved_capacity_margin - r.required_capacity_margin)
     return replace(
         reports[0],
         length=sum(r.length for r in reports),
@@ -305,9 +308,9 @@ def joined(reports: Sequence[CheckReport], motions: Sequence[float]) -> CheckRep
         # NaN where no tensions exist; NumPy's min and max keep it.
         min_tension=float(np.min([r.min_tension for r in reports])),
         max_tension=float(np.max([r.max_tension for r in reports])),
-        capacity_margin=min(r.capacity_margin for r in reports),
-        proved_capacity_margin=min(r.proved_capacity_margin for r in reports),
-        required_capacity_margin=max(r.required_capacity_margin for r in reports),
+        capacity_margin=tightest.capacity_margin,
+        proved_capacity_margin=tightest.proved_capacity_margin,
+        required_capacity_margin=tightest.required_capacity_margin,
         max_cable_speed=max(r.max_cable_speed for r in reports),
         violations=tuple(v for r in reports for v in r.violations),
     )

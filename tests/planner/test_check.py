@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from itertools import product
+from dataclasses import replace
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from model.plan import plan_from_document, sealed
 from model.pose import Pose, interpolate
 from model.rig import Rig, rig_from_document
 from planner.check import _Check, check_path, verify
-from planner.check_report import CheckReport, VerifiedPlan, Violation
+from planner.check_report import CheckReport, VerifiedPlan, Violation, joined
 from planner.costs import capacity_margins
 from planner.path import PosePath
 from planner.planning import make_plan
@@ -213,6 +214,23 @@ def test_a_margin_must_cover_the_inertia_of_the_motion_limits(gachon, scene_with
     assert "acceleration_mm_s2" in fast.cure
     light = report_with(0.4, acceleration_mm_s2=5000.0, jerk_mm_s3=1e6)
     assert light.passed
+
+
+def test_the_margins_of_a_path_with_stops_are_of_the_leg_with_the_least_to_spare(
+    gachon, scene_with
+) -> None:
+    """Loads differ from leg to leg, and with them the margin and what acceleration requires."""
+    scene = scene_with()
+    leg = check_path(gachon, scene, [scene.start] * 2, ends=False)
+    roomy, empty, loaded = (
+        replace(leg, capacity_margin=m, proved_capacity_margin=p, required_capacity_margin=r)
+        for m, p, r in ((90.0, 80.0, 30.0), (12.0, 10.0, 2.0), (29.0, 28.0, 25.0))
+    )
+    for legs in permutations((roomy, empty, loaded)):
+        whole = joined(legs, [0.1] * 3)
+        assert whole.capacity_margin == 29.0
+        assert whole.proved_capacity_margin == 28.0
+        assert whole.required_capacity_margin == 25.0
 
 
 def test_disturbances_count_although_the_weight_alone_is_held(gachon, scene_with) -> None:
