@@ -80,7 +80,7 @@ class StatusResult(FactsDisplay):
         why_no_pose: Why there is no pose, though the drives were read.
         missing: Why drives could not be read; the reference is unknown then, unless it is lost.
         silent: Nodes of the drives that did not answer.
-        how_to_reset: How to reset a drive in fault while others hold the platform; None without.
+        how_to_reset: How to reset where `cdpr reset RIG` alone is refused; None where it is not.
     """
 
     rig: str
@@ -136,7 +136,7 @@ class StatusResult(FactsDisplay):
             return ""
         file, steps = quote(str(rig_file)), []
         if self.how_to_reset is not None:
-            how = self.how_to_reset.replace("`", "").replace("RIG", file)
+            how = self.how_to_reset.replace(" RIG`", f" {file}").replace("`", "")
             steps.append(f"find the cause; {how}")
         elif self.latched is not None or self.reference.valid_after_reset:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
@@ -203,9 +203,10 @@ def status(rig: Rig) -> StatusResult:
         BadInput: The interface is ``virtual``, which reaches no other process.
     """
     require_other_process(rig)
-    settings = BusSettings.of(rig)
-    interlock = MotionInterlock(rig)
-    latched, run = FaultLatch(settings).read_in_motion()
+    settings, interlock = BusSettings.of(rig), MotionInterlock(rig)
+    latch = FaultLatch(settings, rig.drive_names)
+    latched, run = latch.read_in_motion()
+    refusal = latch.why_not_reset(rig.name, latched) if latched else None
     preparing = tuple(one["process"] for one in preparations(bus_name(rig)))
     known = StatusResult(
         rig=rig.name,
@@ -215,6 +216,7 @@ def status(rig: Rig) -> StatusResult:
         latched=latched.cause if latched else None,
         being_set_up=bool(preparing),
         reference=reference_status(interlock),
+        how_to_reset=refusal.next_step if refusal else None,
     )
     if run is not None or preparing:
         return known
@@ -253,7 +255,7 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     if reference.counts and (why := interlock.why_released(seen.restarted, released)):
         reference = replace(reference, counts=False, why_not=why)
     how = how_to_reset(braked=is_braked(rig)) if blocked_in_fault(rig, words) else None
-    read = replace(known, reference=reference, how_to_reset=how)
+    read = replace(known, reference=reference, how_to_reset=known.how_to_reset or how)
     if not reference.counts:
         return read
     as_referenced = interlock.referenced_rig()
@@ -364,8 +366,7 @@ class ReleaseResult(FactsDisplay):
 
     def facts(self) -> Facts:
         """Human-readable drives and reference."""
-        drives = ", ".join(sorted({*self.drives}))
-        return [("drives", drives), ("reference", str(self.reference))]
+        return [("drives", ", ".join(sorted({*self.drives}))), ("reference", str(self.reference))]
 
 
 def release(

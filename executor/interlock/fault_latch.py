@@ -156,6 +156,27 @@ class FaultLatch:
     def _unknown_nodes(self, latched: LatchedFault) -> list[int]:
         return sorted({*latched.nodes} - {*self._nodes})
 
+    def why_not_reset(self, rig: str, latched: LatchedFault) -> Refused | None:
+        """Why a fault is not reset with the rig of this name and its drives; None if it may be."""
+        if latched.rig not in (rig, _UNKNOWN):
+            return Refused(
+                f"the latched fault belongs to rig {latched.rig!r}, not to {rig!r}",
+                where=f"bus {self._bus}",
+                why="its drives are not all known here, and would not be checked",
+                next_step=f"run `cdpr reset` with the rig file of {latched.rig!r}; if it was"
+                " renamed, write its former name there for the reset",
+            )
+        if unknown := self._unknown_nodes(latched):
+            return Refused(
+                f"the latched fault also concerns drives that are not in the rig file: node"
+                f" {', '.join(map(str, unknown))}",
+                where=f"bus {self._bus}",
+                why="they would not be checked",
+                next_step="run `cdpr reset` with the rig file it happened with; a drive that was"
+                " replaced needs its former node id for the reset",
+            )
+        return None
+
     @contextmanager
     def held_for_reset(self, rig: str, shown: LatchedFault | None) -> Iterator[None]:
         """Blocks runs while the block resets the drives, then disengages the latch.
@@ -169,23 +190,8 @@ class FaultLatch:
             Refused: Another fault is latched now, or one of another rig on this bus, or with
                 drives that are not known here.
         """
-        if shown is not None and shown.rig not in (rig, _UNKNOWN):
-            raise Refused(
-                f"the latched fault belongs to rig {shown.rig!r}, not to {rig!r}",
-                where=f"bus {self._bus}",
-                why="its drives are not all known here, and would not be checked",
-                next_step=f"run `cdpr reset` with the rig file of {shown.rig!r}; if it was"
-                " renamed, write its former name there for the reset",
-            )
-        if shown is not None and (unknown := self._unknown_nodes(shown)):
-            raise Refused(
-                f"the latched fault also concerns drives that are not in the rig file: node"
-                f" {', '.join(map(str, unknown))}",
-                where=f"bus {self._bus}",
-                why="they would not be checked",
-                next_step="run `cdpr reset` with the rig file it happened with; a drive that was"
-                " replaced needs its former node id for the reset",
-            )
+        if shown is not None and (refusal := self.why_not_reset(rig, shown)):
+            raise refusal
         if shown is None:
             self.engage(rig, self.path.parent, "a reset did not finish")
         else:

@@ -18,10 +18,13 @@ from calibration.results import write_result
 from cdpr.cli.operate.run import show
 from cdpr.cli.options import run_command
 from cdpr.cli.output import progress_bar
+from drivers.can_bus import BusSettings
 from drivers.plausibility import HOMING_OPTIONS
 from executor import service
 from executor.cameras.sources import choose_cameras
 from executor.drives import DriveStatus, is_simulated
+from executor.interlock import locks
+from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.locks import SetUpLock
 from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import BEGUN, RunFolder
@@ -30,6 +33,7 @@ from executor.remote.command_server import commands_from_start
 from executor.run_result import RunResult
 from executor.safety.fault_messages import page_text
 from executor.service import StatusResult
+from executor.state_machine import State
 from executor.supervision import Supervisor
 from model.errors import BadInput, Fault
 from model.rig import Rig, load_rig, rig_from_document
@@ -242,6 +246,28 @@ def test_status_names_who_prepares_a_motion_and_does_not_read_its_drives(
         assert (result.run, result.preparing, result.being_set_up) == (None, who, True)
         said = [text for name, text in result.facts(Path("rig.yaml")) if name == "motion"]
         assert said == [f"process {n} is preparing one; `cdpr stop` cancels it" for n in who]
+
+
+def test_status_names_no_reset_that_would_be_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The fault is of another rig on the bus, or of drives that this rig file no longer has."""
+    monkeypatch.setattr(locks, "SHARED", tmp_path / "absent")
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr(SetUpLock, "tried", lambda _: nullcontext(False))
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml").with_bus("udp_multicast", "239.74.9.12")
+    for name, nodes, wanted in (
+        ("RIG 2", rig.drive_names, "with the rig file of 'RIG 2'"),
+        (rig.name, (*rig.drive_names, 99), "with the rig file it happened with"),
+        (rig.name, rig.drive_names, "then run cdpr reset 'my rig.yaml'"),
+    ):
+        latch = FaultLatch(BusSettings.of(rig), nodes)
+        latch.engage(name, tmp_path)
+        latch.settle(name, State.LATCHED, "cable 3 is slack", tmp_path)
+        stored = replace(service.status(rig), being_set_up=False)
+        assert wanted in stored.next_step(Path("my rig.yaml"))
+        assert ("cdpr reset 'my" in stored.next_step(Path("my rig.yaml"))) == ("my" in wanted)
+        latch.disengage()
 
 
 def test_a_drive_set_up_for_another_cycle_is_not_said_to_have_lost_power() -> None:
