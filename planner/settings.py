@@ -230,8 +230,11 @@ class AnytimeSettings:
 
     @property
     def longer(self) -> str:
-        """How a user makes the search longer."""
-        return "raise `budget=`" if self.rounds is None else "raise `rounds=`"
+        """How a user makes the search longer, with a value to try."""
+        if self.rounds is None:
+            return f"give it more time, such as `budget={max(10.0 * self.budget, 0.5):g}`"
+        rounds = min(max(10 * self.rounds, 100), WHOLE_LARGEST)
+        return f"give it more rounds, such as `rounds={rounds}`"
 
     def not_found(self, rounds: int, gap: float) -> str:
         """Message after rounds without a path; ``gap`` between the trees, [m]."""

@@ -167,7 +167,7 @@ def _in_unit(value: str, option: str) -> str:
         return ""
     unit = _UNIT.search(option)
     try:
-        return f"{float(value) * (_UNITS[unit[1]] if unit else 1.0):g}"
+        return f"{float(value) * (_UNITS[unit[1]] if unit else 1.0):.12g}"
     except ValueError:
         return value
 

@@ -147,6 +147,7 @@ def test_the_option_is_named_as_it_was_typed(
         ("pass `clearance=0.00987`", "pass --clearance-mm 9.87"),
         ("pass `budget=0.5`", "pass --budget-ms 500"),
         ("pass `rounds=60`", "pass --rounds 60"),
+        ("pass `rounds=1234567`", "pass --rounds 1234567"),
         ("lower `tension_limit=12.5`", "lower --tension-limit-n 12.5"),
     ],
 )

@@ -31,6 +31,21 @@ def test_units_of_options_become_si() -> None:
     assert (settings.budget, settings.longest, settings.seed) == (0.02, 0.8, 3)
 
 
+@pytest.mark.parametrize("kind", [OptimalSettings, TurningSettings])
+@pytest.mark.parametrize(
+    ("given", "to_try"),
+    [
+        ({"rounds": 3}, "rounds=100"),
+        ({"rounds": 250}, "rounds=2500"),
+        ({"rounds": 2**31 - 1}, "rounds=2147483647"),
+        ({"budget": 0.001}, "budget=0.5"),
+        ({"budget": 0.5}, "budget=5"),
+    ],
+)
+def test_a_longer_search_is_offered_with_a_value_to_try(kind, given, to_try) -> None:
+    assert f"`{to_try}`" in kind(**given).longer
+
+
 def test_weights_are_numbers_of_any_type_by_name() -> None:
     settings = settings_from_options(
         PlanningOptions(weight={"length": np.float32(1.0), "clearance": Fraction(2)})  # type: ignore[dict-item]

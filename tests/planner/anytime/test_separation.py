@@ -149,7 +149,7 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
     assert "no path after 9 rounds" in message
     assert "it is not proved that no path exists" in message
     assert "workspace" in message
-    assert "raise `rounds=`" in message
+    assert "such as `rounds=100`" in message
     assert "proved" not in nothing.value.values
 
 
