@@ -171,8 +171,8 @@ def _require_same_orientation(scene: Scene, leg: Leg) -> None:
             f"start and {leg.end} differ in orientation by {np.degrees(angle):.3g} deg",
             where=f"scene {leg.scene.name}",
             why="without `free_rotation=True` the search keeps the platform's orientation",
-            next_step="plan with `free_rotation=True` (the scene then needs rotation_limits), or"
-            f" give the {leg.end} the start's rotation_wxyz",
+            next_step="plan with `planner='optimal'` and `free_rotation=True` (the scene then needs"
+            f" rotation_limits), or give the {leg.end} the start's rotation_wxyz",
             values={"angle_deg": float(np.degrees(angle))},
         )
 

@@ -205,7 +205,8 @@ def rotating_problem(
             "the scene has no limits for rotation",
             where=f"scene {scene.name}",
             why="`free_rotation=True` searches orientations within the scene's rotation_limits",
-            next_step="add a line such as `rotation_limits: {tilt_deg: 10, turn_deg: 30}`",
+            next_step="add a line such as `rotation_limits: {tilt_deg: 8, turn_deg: 2}` that start,"
+            " stops and goal keep",
         )
     rotation = np.array(scene.start.rotation)
     world = build_world(rig, scene, rotation, scene.obstacle_clearance + CLEARANCE_RESERVE)

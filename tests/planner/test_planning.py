@@ -291,8 +291,9 @@ def test_infinite_values_of_an_error_are_null_in_json() -> None:
 def test_start_and_goal_of_different_orientation_are_bad_input(gachon, scene_with) -> None:
     rotated = [float(np.cos(0.05)), 0.0, 0.0, float(np.sin(0.05))]
     scene = scene_with(goal={"position_mm": [0.0, 0.0, 445.0], "rotation_wxyz": rotated})
-    with pytest.raises(BadInput, match=r"differ in orientation by 5\.73 deg"):
+    with pytest.raises(BadInput, match=r"differ in orientation by 5\.73 deg") as caught:
         make_plan(gachon, scene, QUICK)
+    assert "`planner='optimal'` and `free_rotation=True`" in str(caught.value)
 
 
 def with_anchors(rig: Rig, anchors_mm: Sequence[Sequence[float]]) -> Rig:

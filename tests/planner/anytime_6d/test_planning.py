@@ -145,7 +145,10 @@ def test_without_limits_in_the_scene_the_next_step_is_stated() -> None:
     scene = load_scene(CONFIGS / "environment_1.yaml")
     with pytest.raises(BadInput, match="has no limits for rotation") as caught:
         make_plan(GACHON, scene, ROUNDS)
-    assert "rotation_limits: {tilt_deg" in str(caught.value)
+    limits = RAMP.document.rotation_limits  # those the documentation shows and explains
+    wanted = f"{{tilt_deg: {limits.tilt_deg:g}, turn_deg: {limits.turn_deg:g}}}"
+    assert f"`rotation_limits: {wanted}`" in str(caught.value)
+    assert wanted in (CONFIGS.parent / "docs/turning.md").read_text()
 
 
 def test_ends_of_different_orientation_need_the_option() -> None:
