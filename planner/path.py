@@ -55,18 +55,6 @@ class Route:
         return cls(path, first, first, parents, rounds, checks, search_time)
 
 
-def smallest_gap(first: Array, second: Array) -> float:
-    """The smallest distance between the nodes of two trees, [m].
-
-    Row by row: all pairs of two full trees at once take 1 GB.
-
-    Args:
-        first: Positions, shape (i, 3), [m].
-        second: Positions, shape (j, 3), [m].
-    """
-    return min(float(np.linalg.norm(second - node, axis=-1).min()) for node in first)
-
-
 # A sequence of poses as one curve, parametrised by a bound on the motion of any platform point.
 
 

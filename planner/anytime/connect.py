@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from planner.anytime.problem import PathProblem, edge_allowed
 from planner.collision.edges import row_of
 from planner.kernels.jit import inlined, leaf
-from planner.kernels.primitives import RandomState, Vector, uniform
+from planner.kernels.primitives import RandomState, Vector, minus, norm, uniform
 
 Array = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -39,11 +39,14 @@ class Trees(NamedTuple):
         parents: Of each node, -1 for the root, shape (2, NODES).
         counts: Numbers of nodes in both trees, and of edge tests and samples so far, shape (4,);
             zeros at first.
+        gap: The smallest distance ever between nodes of both trees, also of trees since restarted,
+            shape (1,), [m].
     """
 
     nodes: Array
     parents: Integers
     counts: Integers
+    gap: Array
 
 
 @leaf
@@ -80,8 +83,10 @@ def connect(
         if near < 0:
             continue
         far = _nearest(trees, 1 - tree, wanted)
+        across = row_of(nodes[1 - tree, far])
+        trees.gap[0] = min(trees.gap[0], norm(minus(across, wanted)))
         counts[EDGES_TESTED] += 1
-        if edge_allowed(problem, row_of(nodes[1 - tree, far]), wanted):
+        if edge_allowed(problem, across, wanted):
             first, second = (near, far) if tree == 0 else (far, near)
             return _joined(trees, first, wanted, second, path)
     return 0

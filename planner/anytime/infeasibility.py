@@ -26,7 +26,6 @@ from planner.edge_checks import REASONS, edge_problem
 from planner.kernels.jit import kernel
 from planner.kernels.primitives import Vector, plus
 from planner.kernels.scene_arrays import MESH, World, arm, outlet
-from planner.path import smallest_gap
 from planner.settings import OptimalSettings
 
 Array = NDArray[np.float64]
@@ -167,7 +166,7 @@ def no_path(
         length = float(np.linalg.norm(np.diff(found, axis=0), axis=1).sum())
         straight = float(np.linalg.norm(search.ends[1] - search.ends[0]))
         return settings.too_long(where, length, straight, values)
-    gap = _gap(search)
+    gap = float(search.trees.gap[0])
     values["best_distance_mm"] = gap * 1e3
     if is_separated(problem.world, search.ends[0], search.ends[1]):
         return NoSolution(
@@ -193,14 +192,6 @@ def _rotate(scene: Scene) -> str:
     """The remedy that the proof, at the orientation of the start, leaves open."""
     limits = "" if scene.rotation_limits else "add rotation_limits to the scene and "
     return f"{limits}plan with `free_rotation=True`"
-
-
-def _gap(search: AnytimeSearch) -> float:
-    """Smallest distance between nodes of the two trees, [m]."""
-    first, second = (search.trees.nodes[k, : search.trees.counts[k]] for k in (0, 1))
-    if not len(first) or not len(second):
-        return float(np.linalg.norm(search.ends[1] - search.ends[0]))
-    return smallest_gap(first, second)
 
 
 def _blocking_pairs(rig: Rig, scene: Scene, problem: PathProblem, search: AnytimeSearch) -> str:

@@ -99,6 +99,7 @@ def new_search(start: Array, goal: Array, seed: int) -> AnytimeSearch:
             nodes=np.zeros((2, NODES, 3)),
             parents=np.zeros((2, NODES), dtype=np.int64),
             counts=np.zeros(4, dtype=np.int64),
+            gap=np.array([np.linalg.norm(goal - start)]),
         ),
         roadmap=Roadmap(
             nodes=np.zeros((ROADMAP_NODES, 3)),

@@ -25,7 +25,7 @@ from planner.anytime_6d.problem import RotatingProblem, build_objective, move_le
 from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost, LimitedSearch, margin_reserve
 from planner.edge_checks import REASONS
-from planner.path import Progress, Route, smallest_gap
+from planner.path import Progress, Route
 from planner.settings import (
     CLEARANCE_RESERVE,
     TurningSettings,
@@ -178,6 +178,18 @@ class RotatingSearch:
             self.first = line.poses[:count].copy()
         line.counts[0] = count
         return _Kept(line, float(measure(self.problem, line)))
+
+
+def smallest_gap(first: Array, second: Array) -> float:
+    """The smallest distance between the nodes of two trees, [m].
+
+    Row by row: all pairs of two full trees at once take 1 GB.
+
+    Args:
+        first: Positions, shape (i, 3), [m].
+        second: Positions, shape (j, 3), [m].
+    """
+    return min(float(np.linalg.norm(second - node, axis=-1).min()) for node in first)
 
 
 # The search as called from the planner.

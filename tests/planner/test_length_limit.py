@@ -14,9 +14,9 @@ from model.errors import BadInput, distinct_figures
 from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene, empty_scene
+from planner.anytime_6d.path import smallest_gap
 from planner.costs import ClearanceSteps, KinematicCost, LengthPrice, LimitedSearch
 from planner.endpoints import require_feasible_length, require_usable_ends
-from planner.path import smallest_gap
 from planner.settings import OBJECTIVES, OptimalSettings, Weights
 
 

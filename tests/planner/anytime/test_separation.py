@@ -14,6 +14,8 @@ from model.pose import Pose
 from model.rig import Rig
 from model.scene import Scene
 from planner.anytime.infeasibility import FINENESSES, flood_reaches, is_separated
+from planner.anytime.path import advance, handle_of
+from planner.anytime.state import new_search
 from planner.check import check_path
 from planner.planning import make_plan
 from planner.settings import OBJECTIVES, OptimalSettings
@@ -151,6 +153,25 @@ def test_a_search_that_ends_too_early_says_that_nothing_is_proved(
     assert "workspace" in message
     assert "such as `rounds=100`" in message
     assert "proved" not in nothing.value.values
+
+
+def test_the_gap_reported_is_the_smallest_ever_and_so_never_grows(gachon, divided) -> None:
+    """The trees are begun again after some samples; those before may have come closer."""
+    asked, search = problem(gachon, divided), new_search(*ends_of(divided), 0)
+    ever, begun_again, nodes = search.trees.gap[0], 0, 0
+    assert ever == np.linalg.norm(np.subtract(*ends_of(divided)))
+    for _ in range(12):
+        advance(handle_of(asked, search), 1)
+        trees = search.trees
+        first, second = (trees.nodes[k, : trees.counts[k]] for k in (0, 1))
+        begun_again, nodes = begun_again + (len(first) < nodes), len(first)
+        now = np.linalg.norm(first[:, None] - second, axis=-1).min()
+        ever = min(ever, now)
+        assert search.trees.gap[0] <= ever + 1e-12
+        if not begun_again:
+            assert search.trees.gap[0] == pytest.approx(now)
+    assert begun_again
+    assert ever < now, "the last trees are not the closest, else this shows nothing"
 
 
 def test_a_limit_below_the_shortest_path_is_reported(gachon, ready_scene) -> None:
