@@ -313,7 +313,7 @@ def optimal_route(
         search = to_do.first
     else:
         to_do = search = begin(scene, weights)
-    _load(search)
+    load(search)
     prepared = clock()
     rounds = _improve(to_do, search, settings, prepared, progress, clock)
     path = to_do.path
@@ -388,7 +388,7 @@ class CompiledSearch:
         return float(measure(problem, polyline_of(path)))
 
 
-def _load(search: CompiledSearch) -> None:
+def load(search: CompiledSearch) -> None:
     """Calls every kernel of a round once, so that compiling or loading is not timed."""
     advance(handle_of(search.problem, search.state), 0)
     measure_again(search.problem, search.state)

@@ -2,6 +2,8 @@
 
 Rounds find some first paths and then polish the best of them. A round depends only on the seed and
 the rounds before it, so a search can end after any round and be repeated from the number of rounds.
+Where start and goal have one orientation, every other first path is of the search without rotation,
+which is much faster: its path is a good one where little is gained by rotating.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,11 +20,19 @@ from model.errors import BadInput, NoSolution
 from model.pose import Array
 from model.rig import Rig
 from model.scene import Scene
+from planner.anytime.path import CompiledSearch
+from planner.anytime.path import load as load_level
 from planner.anytime_6d import connect as connecting
 from planner.anytime_6d import local_search as polishing
 from planner.anytime_6d.connect import connect
 from planner.anytime_6d.local_search import Line, copied, line_length, measure, new_line, polish
-from planner.anytime_6d.problem import RotatingProblem, build_objective, move_length, set_weights
+from planner.anytime_6d.problem import (
+    RotatingProblem,
+    build_objective,
+    move_allowed,
+    move_length,
+    set_weights,
+)
 from planner.collision.world import build_robot, build_world
 from planner.costs import KinematicCost, LimitedSearch, margin_reserve
 from planner.edge_checks import REASONS
@@ -40,6 +51,8 @@ _SAMPLES, _TRIALS = 50, 40
 _ANOTHER_EVERY = 30
 """After the first rounds, one in this many begins with a new path."""
 _TO_THE_BEST = 0.5
+_LEVEL_ROUNDS = 4
+"""Rounds of the search without rotation before each path taken from it."""
 
 
 @dataclass(slots=True, eq=False)
@@ -59,14 +72,30 @@ class RotatingSearch:
         first: The very first path, shape (k, 7); empty without one.
     """
 
-    def __init__(self, problem: RotatingProblem, start: Array, goal: Array, seed: int) -> None:
-        """A search that has not begun; start and goal shape (7,)."""
+    def __init__(
+        self,
+        problem: RotatingProblem,
+        start: Array,
+        goal: Array,
+        seed: int,
+        level: CompiledSearch | None = None,
+    ) -> None:
+        """A search that has not begun.
+
+        Args:
+            problem: Limits and costs.
+            start: Shape (7,).
+            goal: Shape (7,).
+            seed: Of the random numbers.
+            level: The search without rotation; None where start and goal differ in orientation.
+        """
         self.problem = problem
         self.rounds = 0
         self.tallies = np.zeros(6, dtype=np.int64)
         self.first: Array = np.zeros((0, 7))
         self._ends = np.stack([start, goal])
         self._random = np.random.default_rng(seed)
+        self._level, self._level_is_next, self._level_checks = level, True, 0
         self._kept: list[_Kept] = []
         self._best: _Kept | None = None
         self._trees = np.zeros((2, connecting.NODES, 7))
@@ -81,7 +110,7 @@ class RotatingSearch:
     @property
     def checks(self) -> int:
         """Number of moves checked."""
-        return int(self.tallies.sum())
+        return int(self.tallies.sum()) + self._level_checks
 
     @property
     def path(self) -> Array | None:
@@ -106,6 +135,8 @@ class RotatingSearch:
     def weigh(self, weights: Weights) -> None:
         """Changes the weights of the objective."""
         set_weights(self.problem.objective, weights)
+        if self._level is not None:
+            self._level.weigh(weights)
         for kept in (*self._kept, *filter(None, [self._best])):
             kept.cost = float(measure(self.problem, kept.line))
         for kept in self._kept:
@@ -148,6 +179,7 @@ class RotatingSearch:
         if len(self._kept) < _KEPT or begun % _ANOTHER_EVERY == 0:
             new = self._begun()
             if new is not None:
+                self._note(new)
                 if len(self._kept) == _KEPT:
                     self._kept.remove(max(self._kept, key=lambda kept: kept.cost))
                 self._kept.append(new)
@@ -159,7 +191,21 @@ class RotatingSearch:
         return self._kept[int(self._random.random() * len(self._kept))]
 
     def _begun(self) -> _Kept | None:
-        line = new_line()
+        line, count = new_line(), 0
+        if self._level is not None and self._level_is_next:
+            count = self._without_rotation(self._level, line.poses)
+        self._level_is_next = count == 0
+        if count == 0:
+            count = self._connected(line.poses)
+        if count == 0:
+            return None
+        if not len(self.first):
+            self.first = line.poses[:count].copy()
+        line.counts[0] = count
+        return _Kept(line, float(measure(self.problem, line)))
+
+    def _connected(self, poses: Array) -> int:
+        """Writes a path of the two trees; its number of poses, 0 if they have not met."""
         draws = self._random.random((_SAMPLES, connecting.DRAWS))
         count = connect(
             self.problem,
@@ -169,15 +215,28 @@ class RotatingSearch:
             self._parents,
             self._grown,
             self.tallies,
-            line.poses,
+            poses,
         )
-        if count == 0:
-            return None
-        self._grown[:] = 0
-        if not len(self.first):
-            self.first = line.poses[:count].copy()
-        line.counts[0] = count
-        return _Kept(line, float(measure(self.problem, line)))
+        if count > 0:
+            self._grown[:] = 0
+        return int(count)
+
+    def _without_rotation(self, level: CompiledSearch, poses: Array) -> int:
+        """Writes the best path without rotation; its number of poses, 0 if there is none.
+
+        That search keeps a smaller reserve of the capacity margin, so its path may be refused here.
+        After one failure it is not asked again: its rounds without a path take long.
+        """
+        for _ in range(_LEVEL_ROUNDS):
+            level.advance()
+        path, self._level_checks = level.path, level.checks
+        if path is not None and len(path) <= len(poses):
+            found = poses[: len(path)]
+            found[:, :3], found[:, 3:] = path, self._ends[0, 3:]
+            if all(move_allowed(self.problem, *ends, self.tallies) for ends in pairwise(found)):
+                return len(path)
+        self._level = None
+        return 0
 
 
 def smallest_gap(first: Array, second: Array) -> float:
@@ -260,15 +319,24 @@ def rotating_route(
     start, goal = space.coordinates(scene.start), space.coordinates(scene.goal)
     _load(RotatingSearch(problem, start, goal, settings.seed), weights)
 
+    def level_search(at: Scene, by: Weights) -> CompiledSearch | None:
+        if not np.array_equal(start[3:], goal[3:]):
+            return None
+        level = CompiledSearch(rig, at, by, kinematic, settings.seed)
+        load_level(level)
+        return level
+
     def begin(at: Scene, by: Weights) -> RotatingSearch:
-        return RotatingSearch(rotating_problem(rig, at, by, kinematic), start, goal, settings.seed)
+        own, level = rotating_problem(rig, at, by, kinematic), level_search(at, by)
+        return RotatingSearch(own, start, goal, settings.seed, level)
 
     to_do: RotatingSearch | LimitedSearch[RotatingSearch]
     if settings.longest < math.inf:
         to_do = LimitedSearch(begin, scene, weights, settings.longest, kinematic)
         search = to_do.first
     else:
-        to_do = search = RotatingSearch(problem, start, goal, settings.seed)
+        level = level_search(scene, weights)
+        to_do = search = RotatingSearch(problem, start, goal, settings.seed, level)
     began, spent, rounds = clock(), 0.0, 0
     while not _is_over(settings, search, rounds, spent):
         to_do.advance()

@@ -14,18 +14,28 @@ from model.errors import BadInput, InvalidFile, NoSolution
 from model.files.documents import PoseDocument
 from model.files.plan_file import PlanDocument
 from model.plan import load_plan, plan_facts, plan_from_document, save_plan
-from model.pose import Pose
+from model.pose import Array, Pose
 from model.rig import Rig
 from model.scene import Scene, empty_scene, load_scene
 from model.statics.wrench_sets import rms_anchor_radius
-from planner.anytime_6d.path import rotating_route
+from planner.anytime.path import CompiledSearch
+from planner.anytime_6d.local_search import measure, new_line
+from planner.anytime_6d.path import RotatingSearch, rotating_route
+from planner.anytime_6d.problem import RotatingProblem
 from planner.check import check_path, verify
 from planner.costs import KinematicCost
 from planner.path import Route
 from planner.planning import make_plan
-from planner.settings import TurningSettings
+from planner.settings import OBJECTIVES, TurningSettings
 from tests.configs import CONFIGS, GACHON, HALL
-from tests.planner.anytime_6d.rotating_scenes import Judge, quaternion, turning, upside_down
+from tests.planner.anytime_6d.rotating_scenes import (
+    Judge,
+    problem_of,
+    quaternion,
+    row,
+    turning,
+    upside_down,
+)
 
 ROUNDS = TurningSettings(rounds=60)
 RAMP = load_scene(CONFIGS / "turn.yaml")
@@ -80,6 +90,52 @@ def test_the_same_seed_and_rounds_give_the_same_path_and_others_another() -> Non
     assert first.edge_checks == again.edge_checks
     other = routed(RAMP, TurningSettings(seed=1, rounds=60))
     assert other.path.tolist() != first.path.tolist()
+
+
+@pytest.mark.parametrize("name", ["length", "kinematic", "capacity"])
+def test_rotation_never_costs_more_than_the_path_without_it(name) -> None:
+    """Four rounds of that are done in the first of this; a repeated search finds the same path."""
+    scene, weights = turning("environment_3", 8.0, 2.0), OBJECTIVES[name].normalized()
+    kinematic = KinematicCost(GACHON, scene.start.rotation)
+    settings = TurningSettings(weights=OBJECTIVES[name], seed=2, rounds=1)
+    found, again = (routed(scene, settings).path for _ in range(2))
+    assert found.tolist() == again.tolist()
+    level = CompiledSearch(GACHON, scene, weights, kinematic, settings.seed)
+    for _ in range(4):
+        level.advance()
+    path = np.zeros((len(level.path), 7))
+    path[:, :3], path[:, 3] = level.path, 1.0
+    cost, of_level = (_cost(problem_of(GACHON, scene, weights), poses) for poses in (found, path))
+    assert cost <= of_level
+
+
+def _cost(problem: RotatingProblem, poses: Array) -> float:
+    line = new_line()
+    line.poses[: len(poses)], line.counts[0] = poses, len(poses)
+    return float(measure(problem, line))
+
+
+def test_a_path_without_rotation_that_is_not_allowed_here_is_not_used() -> None:
+    """It keeps a smaller reserve of the capacity margin; this one even passes through a post."""
+
+    class Blocked:
+        checks = 3
+
+        def __init__(self) -> None:
+            self.path, self.rounds = np.array([scene.start.position, scene.goal.position]), 0
+
+        def advance(self) -> None:
+            self.rounds += 1
+
+    scene = turning("environment_1", 8.0, 2.0)
+    blocked = Blocked()
+    ends = row(scene.start), row(scene.goal)
+    search = RotatingSearch(problem_of(GACHON, scene), *ends, 0, blocked)  # type: ignore[arg-type]
+    for _ in range(12):
+        search.advance()
+    assert search.path is not None
+    assert len(search.path) > 2
+    assert blocked.rounds == 4, "it is not asked again"
 
 
 def test_more_rounds_are_never_worse_and_a_plan_with_a_budget_states_them() -> None:
