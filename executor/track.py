@@ -255,7 +255,7 @@ def track_sources(
         finally:
             for text in skipped_files(result.unused_files()):
                 listener.remark(text)
-    for text in result.together.clocks if result.together is not None else ():
+    for text in result.together.remarks if result.together is not None else ():
         listener.remark(text)
     for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
         skipped = (frames.late, frames.truncated) if isinstance(frames, LiveCamera) else (0, 0)

@@ -225,13 +225,14 @@ class MultiCameraCount:
         without_partner: Images without an image of another camera at about the same time.
         apart: Frame sets with a pose dropped because its image is too far from the others in time.
         without_speed: Frame sets with a pose dropped because its velocity is unknown.
-        clocks: Pairs of cameras whose clocks differ, one sentence each; known at the end.
+        remarks: Pairs of cameras whose clocks differ, cameras without a pose and disagreement, one
+            sentence each; known at the end.
     """
 
     without_partner: int = 0
     apart: int = 0
     without_speed: int = 0
-    clocks: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
 
 
 def track_cameras(
@@ -262,23 +263,36 @@ def track_cameras(
     """
     poses, reason, common = 0, "the sources have no images", MultiCameraFusion(within)
     exchanged: tuple[str, str] | None = None
-    running = {name: _ignoring_no_platform(stream) for name, stream in streams.items()}
+    disagreed = agreed = 0
+    blind: dict[str, str] = {}
+    running = {name: _seeing(name, stream, blind) for name, stream in streams.items()}
     for frame, images in enumerate(synchronize_frames(running, 2.0 * within)):
         alone = {name: replace(one, frame=frame) for name, one in images.items()}
-        found = common.of({name: one.observation for name, one in alone.items()})
+        observed = {name: one.observation for name, one in alone.items()}
+        found = common.of(observed)
         count.without_partner += len(alone) == 1
         count.apart, count.without_speed = common.apart, common.without_speed
         clearance = None
         if isinstance(found, PoseMeasurement):
             poses += 1
+            agreed += sum(isinstance(one, PoseMeasurement) for one in observed.values()) > 1
             clearance = clearance_of(model, found) if model is not None else None
         else:
-            reason, exchanged = found.reason, _exchanged(rig, alone)
+            contradicts = DISAGREE in found.reason
+            if contradicts or not disagreed:
+                reason = found.reason
+            if contradicts:
+                disagreed += 1
+                exchanged = exchanged_cameras(rig, observed) or exchanged
         yield LoggedImage(next(iter(alone.values())).name, found, clearance, frame), alone
-    count.clocks = common.clock_remarks()
-    if not poses:
+    count.remarks = common.clock_remarks()
+    if poses:
+        count.remarks += [f"camera {name}: {why}" for name, why in blind.items()]
+    if disagreed and agreed:
+        count.remarks.append(f"cameras disagreed at {disagreed} of {frame + 1} times")
+    if not poses or (disagreed and not agreed):
         why, next_step = (
-            "; ".join(count.clocks),
+            "; ".join(count.remarks),
             "check that each camera has its own source and sees the platform; `cdpr track` with a"
             " single source gives details",
         )
@@ -297,26 +311,26 @@ def track_cameras(
         )
 
 
-def _exchanged(rig: Rig, seen: Mapping[str, LoggedImage]) -> tuple[str, str] | None:
+def exchanged_cameras(rig: Rig, found: Mapping[str, Observation]) -> tuple[str, str] | None:
     """Two cameras whose poses of the platform agree only if their images are exchanged."""
-    found = {name: one.observation for name, one in seen.items()}
     poses = {name: one.pose for name, one in found.items() if isinstance(one, PoseMeasurement)}
-    for a, b in combinations(poses, 2):
-        b_from_a = rig.camera(b).world_from_camera.compose(
-            rig.camera(a).world_from_camera.inverse()
-        )
-        by_b, by_a = b_from_a.compose(poses[a]), b_from_a.inverse().compose(poses[b])
-        if pose_gap(poses[a], poses[b]) > 1.0 >= pose_gap(by_a, by_b):
-            return a, b
+    for one, other in combinations((c for c in rig.cameras if c.name in poses), 2):
+        a, b = poses[one.name], poses[other.name]
+        other_from_one = other.world_from_camera.compose(one.world_from_camera.inverse())
+        by_other, by_one = other_from_one.compose(a), other_from_one.inverse().compose(b)
+        if pose_gap(a, b) > 1.0 >= pose_gap(by_other, by_one):
+            return one.name, other.name
     return None
 
 
-def _ignoring_no_platform(stream: Iterator[LoggedImage]) -> Iterator[LoggedImage]:
-    """Ends the stream of a camera without any pose silently: the others may have poses."""
+def _seeing(
+    name: str, stream: Iterator[LoggedImage], blind: dict[str, str]
+) -> Iterator[LoggedImage]:
+    """Ends the stream of a camera without any pose, with the reason: the others may have poses."""
     try:
         yield from stream
-    except NoPlatformSeen:
-        return
+    except NoPlatformSeen as error:
+        blind[name] = error.what
 
 
 # Drawing of measurements into images.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -230,6 +230,41 @@ def test_two_that_agree_once_exchanged_are_not_to_be_calibrated_again(
         list(tracked)
     assert ("exchange the sources" in caught.value.next_step) is exchange
     assert ("calibrate the cameras' poses again" in caught.value.next_step) is not exchange
+
+
+@pytest.mark.parametrize("agreed", [0, 1])
+def test_images_without_partner_do_not_hide_that_cameras_disagree(
+    rig: Rig, camera: Camera, agreed: int
+) -> None:
+    """Live cameras begin and end at different times."""
+    count, names = MultiCameraCount(), ("front", "side")
+
+    def stream(name: str) -> Iterator[LoggedImage]:
+        for k in range(6):
+            x = 0.03 if name == "side" and k >= 1 + agreed else 0.0
+            if not (k == 0 and name == "side"):
+                yield logged(replace(measured([x, 0.0, 0.4], [1e-4] * 3), time=0.1 * k))
+
+    streams = {name: stream(name) for name in names}
+    tracked = track_cameras(rig, streams, 0.04, count)
+    if agreed:
+        assert len(list(tracked)) == 6
+        assert "cameras disagreed at 4 of 6 times" in count.remarks
+        return
+    with pytest.raises(NoPlatformSeen, match=r"front and side disagree by 30\.0 mm"):
+        list(tracked)
+
+
+def test_a_camera_that_gave_no_pose_is_named_though_another_gave_some(rig: Rig) -> None:
+    def dark() -> Iterator[LoggedImage]:
+        yield LoggedImage("0.png", NoPose(0.0, "no tag found"))
+        raise NoPlatformSeen("none of 1 image gives a pose of the platform: no tag found")
+
+    count = MultiCameraCount()
+    seen = logged(measured([0.0, 0.0, 0.4], [1e-4] * 3))
+    assert len(list(track_cameras(rig, {"front": iter([seen]), "side": dark()}, 0.05, count))) == 1
+    (remark,) = count.remarks
+    assert remark.startswith("camera side: none of 1 image gives a pose")
 
 
 def test_of_three_the_one_that_disagrees_is_left_out() -> None:

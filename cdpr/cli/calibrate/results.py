@@ -22,7 +22,7 @@ from model.files.documents import write_atomic
 from model.files.output import require_new_file
 from model.rig import load_rig
 
-SOURCE = argument("folder of images, video file or camera index", "SOURCE")
+SOURCE = argument("folder of images, video file, camera index or address", "SOURCE")
 PICTURES = option("number of images from a video or camera (default: 20; tags: 40)", min=1)
 CAMERA = option("name of the camera in the rig file (default: the first)")
 
