@@ -19,6 +19,7 @@ from model.pose import (
     matrix_from_rotation_vector,
     read_only,
     rotation_vector_from_matrix,
+    skew,
 )
 
 if TYPE_CHECKING:
@@ -347,16 +348,21 @@ class EncoderPoses:
 
 
 class PoseMonitor:
-    """Detects that measured positions differ from the encoders' by more than errors explain."""
+    """Detects that measured poses differ from the encoders' by more than errors explain.
 
-    def __init__(self, tolerance: float, platform_error: float) -> None:
+    They do where the platform's origin or an anchor is too far off, so rotations count as well.
+    """
+
+    def __init__(self, anchors: Array, tolerance: float, platform_error: float) -> None:
         """Starts without an image.
 
         Args:
+            anchors: Platform frame, shape (m, 3), [m].
             tolerance: Difference that the drives are allowed, [m].
             platform_error: Of the encoder position along any axis, 95 %, [m].
         """
-        self._tolerance, self._platform = tolerance, (platform_error / Z_95) ** 2 * np.eye(6)
+        self._points = np.vstack([np.zeros(3), anchors])
+        self._tolerance, self._platform = tolerance, (platform_error / Z_95) ** 2 * np.eye(3)
         self._images = 0
 
     def take(self, measured: PoseMeasurement, encoder_pose: Pose | None) -> str:
@@ -367,13 +373,20 @@ class PoseMonitor:
         """
         if self._images >= OFF_IMAGES or measured.unstated or encoder_pose is None:
             return ""
-        distance = measured.pose.distance_to(encoder_pose)
-        covariance = measured.covariance + measured.shared + self._platform
-        explained = self._tolerance + _CHI_95 * largest_deviations(covariance)[0]
-        self._images = self._images + 1 if distance > explained else 0
+        arms = self._points @ measured.pose.rotation.T
+        offsets = measured.pose.position + arms - encoder_pose.apply(self._points)
+        by_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], 2)
+        covariance = by_pose @ (measured.covariance + measured.shared) @ by_pose.swapaxes(1, 2)
+        largest = np.linalg.norm(covariance + self._platform, 2, axis=(1, 2))
+        explained = self._tolerance + _CHI_95 * np.sqrt(largest)
+        off = np.linalg.norm(offsets, axis=1)
+        worst = int(np.argmax(off - explained))
+        self._images = self._images + 1 if off[worst] > explained[worst] else 0
         if self._images < OFF_IMAGES:
             return ""
+        angle = math.degrees(measured.pose.angle_to(encoder_pose))
         return (
-            f"{distance * 1e3:.1f} mm from its encoder pose, in {OFF_IMAGES} images in a row;"
-            f" tolerances and stated errors (95 %) explain {explained * 1e3:.1f} mm"
+            f"{measured.pose.distance_to(encoder_pose) * 1e3:.1f} mm and {angle:.1f} deg from its"
+            f" encoder pose, in {OFF_IMAGES} images in a row: up to {off[worst] * 1e3:.1f} mm, of"
+            f" which tolerances and stated errors (95 %) explain {explained[worst] * 1e3:.1f} mm"
         )

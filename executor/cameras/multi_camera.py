@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,12 +12,20 @@ from executor.cameras.process import CameraSample, FrameRequest, sample_without_
 from executor.recording.record_files import CameraRecord
 from executor.remote.status import RunStatus
 from executor.supervision import RequestBoard, StopReason
+from model.cameras import exchanged_sources
 from model.clearance import ClearanceModel
 from model.pose import Pose
 from model.progress import SILENT, Listener
 from tracking.clearance import ClearanceMonitor, MeasuredClearance, clearance_of
 from tracking.fusion import MultiCameraFusion
-from tracking.measurement import EncoderPoses, PoseMeasurement, PoseMonitor, rates
+from tracking.measurement import (
+    EncoderPoses,
+    Observation,
+    PoseMeasurement,
+    PoseMonitor,
+    rates,
+)
+from tracking.track import exchanged_cameras
 
 # Fusion of several cameras, and monitors of what they measure.
 
@@ -59,12 +68,15 @@ class MultiCameraMonitor:
         # good one measures, and if they disagree, the correct one is unknown.
         self._watches = {name: ClearanceMonitor(limit) for name in ("", *names)}
         self._encoders, motion = EncoderPoses(), model.rig.motion
-        explained = motion.start_tolerance + motion.following_error, model.rig.platform_error or 0.0
-        self._poses = {name: PoseMonitor(*explained) for name in self._watches}
+        tolerance = motion.start_tolerance + motion.following_error
+        self._poses = {
+            name: PoseMonitor(model.rig.anchors, tolerance, model.rig.platform_error or 0.0)
+            for name in self._watches
+        }
         self._within = 0.5 / rate
         self._common = MultiCameraFusion(self._within)
         self._moments = self._disagree = 0
-        self._differs = False
+        self._differ: set[str] = set()
 
     def of(self, samples: Mapping[str, CameraSample]) -> CameraSample:
         """The fused sample of a frame.
@@ -79,11 +91,11 @@ class MultiCameraMonitor:
         found = self._common.of(each) if self._several else next(iter(each.values()))
         clearance = None
         if isinstance(found, PoseMeasurement):
-            self._count_disagreement("")
+            self._count_disagreement("", each)
             clearance = self._watch("", found)
         else:
             seen = any(isinstance(one, PoseMeasurement) for one in each.values())
-            self._count_disagreement(found.reason if seen else "")
+            self._count_disagreement(found.reason if seen else "", each)
         if self._several:
             for name, sample in samples.items():
                 self.watch_alone(name, sample)
@@ -115,22 +127,26 @@ class MultiCameraMonitor:
         if near and not self.near:
             self.near = near + (f", measured by camera {name} alone" if name else "")
         off = self._poses[name].take(found, self._encoders.at(found.time))
-        if off and not self._differs:
-            self._differs = True
+        if off and "" not in self._differ:
+            self._differ.add(name)
             who = f"camera {name}" if name else "the cameras" if self._several else "the camera"
             self.news.append(CameraNews("pose_differs", f"{who} measured the platform {off}"))
         return clearance
 
-    def _count_disagreement(self, reason: str) -> None:
+    def _count_disagreement(self, reason: str, found: Mapping[str, Observation]) -> None:
         self._disagree = self._disagree + 1 if reason else 0
         if self._disagree == BLIND_IMAGES:
+            exchanged = exchanged_cameras(self._model.rig, found)
+            cause = f" ({exchanged_sources(*exchanged)[0]})" if exchanged else ""
             text = (
-                f"{reason}, {BLIND_IMAGES} times in a row; fused clearance is not measured,"
+                f"{reason}, {BLIND_IMAGES} times in a row{cause}; fused clearance is not measured,"
                 " each camera monitors it alone"
             )
             self.news.append(CameraNews("camera_sees_nothing", text))
 
 
+#: True poses that go with a request: a synthetic image shows the platform of its latency ago.
+_TRUE_POSES = 50
 #: Largest wait for the last images at the end of a run, and after a stop; interval of checks, [s].
 PATIENCE, HURRY, ROUND = 20.0, 2.0, 0.05
 
@@ -190,6 +206,7 @@ class RunCameras:
         self.newest: tuple[PoseMeasurement, MeasuredClearance | None] | None = None
         """The newest fused pose and its clearance; None at first."""
         self._reported: dict[str, str] = {}
+        self._true_poses: deque[tuple[float, Pose]] = deque(maxlen=_TRUE_POSES)
         self._news: list[CameraNews] = []
 
     @property
@@ -219,16 +236,23 @@ class RunCameras:
             encoder_pose: Platform pose from the encoders; None if unknown.
         """
         self._now = asked
-        self._common.drive(time, encoder_pose)
+        self.drive(time, true_pose, encoder_pose)
         for client in self._clients:
             self._put(client, client.collect())
         self._process_complete()
-        trigger = FrameRequest(self._frame, time, asked, true_pose, encoder_pose)
+        known = tuple(self._true_poses)
+        trigger = FrameRequest(self._frame, time, asked, true_pose, encoder_pose, known)
         asked_clients = frozenset(client.name for client in self._clients if client.ask(trigger))
         if asked_clients:
             self._open.append(_FrameSet(trigger, asked_clients))
         self._frame += 1
         self._report_trouble()
+
+    def drive(self, time: float, true_pose: Pose | None, encoder_pose: Pose | None) -> None:
+        """Takes poses between which images are taken; arguments as for `trigger`."""
+        self._common.drive(time, encoder_pose)
+        if true_pose is not None:
+            self._true_poses.append((time, true_pose))
 
     def news(self) -> list[CameraNews]:
         """New conditions since the last call."""
@@ -366,9 +390,17 @@ class CameraWatch:
         self._report, self._clearance_stop, self._listener = report, clearance_stop, listener
 
     def trigger(
-        self, time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None
+        self,
+        time: float,
+        asked: float,
+        true_pose: Pose | None,
+        encoder_pose: Pose | None,
+        is_due: bool = True,
     ) -> None:
-        """Requests an image; arguments as for `RunCameras.trigger`."""
+        """Requests an image if one is due; other arguments as for `RunCameras.trigger`."""
+        if not is_due:
+            self._cameras.drive(time, true_pose, encoder_pose)
+            return
         self._cameras.trigger(time, asked, true_pose, encoder_pose)
         self._report_news(asked)
         each = self._cameras.as_dict()

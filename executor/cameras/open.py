@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from functools import partial
@@ -174,7 +175,10 @@ class RenderedImages:
         """Renders the platform at its true pose, of the true latency ago."""
         if trigger.true_pose is None:
             raise Fault("the synthetic camera has no platform pose")
-        self._poses.append((trigger.time, trigger.true_pose))
+        known = self._poses[-1][0] if self._poses else -math.inf
+        self._poses += [pose for pose in trigger.true_poses if pose[0] > known]
+        if not self._poses or self._poses[-1][0] < trigger.time:
+            self._poses.append((trigger.time, trigger.true_pose))
         exposed = trigger.time - self._true_latency
         image = self._film.image(exposed, self._pose_at(exposed), trigger.frame)
         return image, -self._latency

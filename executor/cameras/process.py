@@ -41,6 +41,7 @@ class FrameRequest:
         asked: The same time, monotonic, [s].
         true_pose: Of the simulated platform; None with a real camera.
         encoder_pose: Platform pose from the encoders; None if unknown.
+        true_poses: The latest true poses of the simulated platform, with their times, [s].
     """
 
     frame: int
@@ -48,6 +49,7 @@ class FrameRequest:
     asked: float
     true_pose: Pose | None
     encoder_pose: Pose | None = None
+    true_poses: tuple[tuple[float, Pose], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -345,9 +345,11 @@ class RecordWriter:
                 self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
 
 
-#: Requests an image: time since the start of the run [s], the same time on the monotonic clock
-#: [s], true pose of the simulated platform, and encoder pose.
-FrameTrigger = Callable[[float, float, Pose | None, Pose | None], None]
+#: Takes a pose: time since the start of the run [s], the same time on the monotonic clock [s], true
+#: pose of the simulated platform, encoder pose, and whether an image is due.
+FrameTrigger = Callable[[float, float, Pose | None, Pose | None, bool], None]
+#: Longest time between these, also where images are rarer: platforms move along curves, [s].
+_BETWEEN_POSES = 0.1
 
 
 class Recorder:
@@ -371,7 +373,7 @@ class Recorder:
         Args:
             folder: Takes cycles and events as they happen.
             status: Updated with cycles and events.
-            trigger: Called for every image.
+            trigger: Called for every image, and between rare ones.
             every: Cycles between images.
             progress: Called regularly with the number of completed rows.
             announce: Called with a sentence when a stop is reached and left.
@@ -388,16 +390,15 @@ class Recorder:
         self._status = status
         self._trigger, self._progress = trigger, progress
         self._every = every
+        most = max(_BETWEEN_POSES / prepared.checked.table.cycle + 1e-9, 1.0)
+        divisors = (k for k in range(1, every + 1) if every % k == 0 and k <= most)
+        self.pose_every = max(divisors) if trigger else 0
+        """Cycles between poses of the platform; 0 without images."""
         self._began: float | None = None
         self.last = 0.0
         """Start of the last cycle, on the loop's clock, [s]."""
         self.state = State.READY
         """State of the run then."""
-
-    @property
-    def pose_every(self) -> int:
-        """Cycles between true poses that an image needs; 0 without images."""
-        return 0 if self._trigger is None else self._every
 
     def take_cycle(self, record: CycleRecord, true_pose: Pose | None) -> None:
         """Records a cycle.
@@ -423,9 +424,9 @@ class Recorder:
                     failure = failure or error
         if record.cycle % self._every == 0:
             self._progress(record.index)
-            if self._trigger is not None:
-                encoder_pose = self.log.encoder_pose(record)
-                self._trigger(record.at - self._began, record.at, true_pose, encoder_pose)
+        if self._trigger is not None and record.cycle % self.pose_every == 0:
+            encoder_pose, is_due = self.log.encoder_pose(record), record.cycle % self._every == 0
+            self._trigger(record.at - self._began, record.at, true_pose, encoder_pose, is_due)
         self.writer.take_cycles(record.at)
         if failure is not None:
             raise failure

@@ -97,6 +97,19 @@ def test_a_synthetic_image_shows_the_platform_of_its_latency_ago() -> None:
     np.testing.assert_allclose(film.shown, expected, atol=1e-12)
 
 
+def test_a_synthetic_image_of_a_rare_camera_shows_the_curve_between_two_requests() -> None:
+    """Once a second, of a platform on a circle; poses come ten times a second."""
+    film: Any = Film()
+    source = RenderedImages(film, latency=0.25, true_latency=0.25)
+    poses = [(0.1 * k, Pose.level([np.cos(0.1 * k), 0.0, 0.0])) for k in range(51)]
+    for k in range(6):
+        recent = tuple(poses[max(0, 10 * k - 20) : 10 * k + 1])
+        source.image(FrameRequest(k, 1.0 * k, 0.0, recent[-1][1], None, recent))
+    np.testing.assert_allclose(
+        film.shown[1:], [(k - 0.25, np.cos(k - 0.25)) for k in range(1, 6)], atol=2e-3
+    )
+
+
 def test_a_live_image_may_be_exposed_before_it_is_requested() -> None:
     camera: Any = SimpleNamespace(
         read=lambda: Frame(12.26, np.zeros((4, 4), np.uint8), "x"), late=3, truncated=1

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import threading
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -262,21 +264,27 @@ def test_what_is_not_a_fault_of_the_disk_is_one_of_the_record(
         writer.take_event(RunEvent(0.0, "stop", "stop requested"))
 
 
-def recorder_of(folder: RunFolder, done: list[str], monkeypatch: pytest.MonkeyPatch) -> Recorder:
+def recorder_of(
+    folder: RunFolder,
+    done: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    every: int = 1,
+    trigger: Callable[..., None] | None = None,
+) -> Recorder:
     """A recorder that writes no cycles; ``done`` receives what it calls."""
     rig = load_rig(CONFIGS / "gachon_8_6.yaml")
     goal = {"position_mm": [0, 0, 445]}
     stops = [{"name": name, "dwell_s": 0.0, **goal} for name in ("one", "two")]
     data = {"schema_version": 1, "name": "s", "start": goal, "goal": goal, "stops": stops}
     scene = scene_from_document(SceneDocument.model_validate(data))
-    table = SimpleNamespace(dwells=(Dwell(0, 0), Dwell(0, 0)))
+    table = SimpleNamespace(dwells=(Dwell(0, 0), Dwell(0, 0)), cycle=0.01)
     prepared: Any = SimpleNamespace(rig=rig, scene=scene, checked=SimpleNamespace(table=table))
     recorder = Recorder(
         prepared,
         folder,
         RunStatus(prepared, folder.path, LocalRequests(), simulated_time=True),
-        trigger=lambda *_: done.append("image"),
-        every=1,
+        trigger=trigger or (lambda *_: done.append("image")),
+        every=every,
         progress=lambda _row: done.append("progress"),
         announce=lambda _text: done.append("announced"),
     )
@@ -320,3 +328,20 @@ def test_an_event_from_before_the_first_cycle_is_at_its_time(
     for at in (0.0, 36_123.3, 36_123.5):
         recorder.take_event(LoopEvent(0, at, "simulated", "the drives are simulated"))
     assert [event.time_s for event in folder.events()] == [0.0, 0.0, 0.1]
+
+
+@pytest.mark.parametrize(
+    ("every", "pose_every"), [(1, 1), (10, 10), (20, 10), (50, 10), (33, 3), (7, 7), (13, 1)]
+)
+def test_poses_come_at_least_ten_times_a_second_and_with_every_image(
+    folder: RunFolder, monkeypatch: pytest.MonkeyPatch, every: int, pose_every: int
+) -> None:
+    """Of 10 ms; a camera may take an image only once a second."""
+    due: list[bool] = []
+    recorder = recorder_of(folder, [], monkeypatch, every, lambda *given: due.append(given[4]))
+    record = cycle_at(0.0, State.READY)
+    assert recorder.pose_every == pose_every
+    for k in range(2 * every + 1):
+        recorder.take_cycle(replace(record, cycle=k, at=0.01 * k), None)
+    assert len(due) == 2 * every // pose_every + 1
+    assert due == [k * pose_every % every == 0 for k in range(len(due))]

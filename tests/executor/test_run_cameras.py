@@ -6,7 +6,7 @@ import math
 import multiprocessing
 import os
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +38,7 @@ from executor.proposals import homing_proposal
 from executor.remote.client import camera_line
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
-from model.pose import Pose
+from model.pose import Pose, matrix_from_rotation_vector
 from model.rig import load_rig
 from tests.cli.plans import RIG, free_scene
 from tracking.clearance import MeasuredClearance, clearance_of
@@ -131,16 +131,25 @@ def at_time(time: float) -> Pose:
 class Moving(Scripted):
     """A camera that sees a platform move, in images taken some time after the request."""
 
-    def __init__(self, name: str, delays: Sequence[int], late: float) -> None:
+    def __init__(
+        self,
+        name: str,
+        delays: Sequence[int],
+        late: float,
+        truth: Callable[[float], Pose] = at_time,
+    ) -> None:
         super().__init__(name, delays)
-        self._late = late
+        self._late, self._truth = late, truth
 
     def answer_within(self, patience: float) -> CameraSample | None:
         asked = self.unanswered
         if asked is not None:
-            shift = at_time(asked.time + self._late).position[0] - HERE.position[0]
-            self._off = {"shift": shift, "late": self._late}
-        return super().answer_within(patience)
+            self._off = {"late": self._late}
+        sample = super().answer_within(patience)
+        if sample is None:
+            return None
+        found = replace(sample.found, pose=self._truth(sample.found.time))  # type: ignore[arg-type]
+        return replace(sample, found=found)
 
 
 def never() -> bool:
@@ -306,7 +315,7 @@ def test_a_platform_off_its_encoder_pose_is_reported_once(
         return
     (news,) = reported
     who = "the cameras" if len(names) > 1 else "the camera"
-    assert news.text.startswith(f"{who} measured the platform {abs(shift_mm):.1f} mm from its")
+    assert news.text.startswith(f"{who} measured the platform {abs(shift_mm):.1f} mm and 0.0 deg")
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -322,7 +331,7 @@ def test_a_moving_platform_is_compared_with_the_encoders_at_the_time_of_the_imag
 
 
 def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
-    monitor = PoseMonitor(0.003, 0.0)
+    monitor = PoseMonitor(_RIG.anchors, 0.003, 0.0)
     found = seen_at(FrameRequest(0, 0.0, 0.0, None), 0.02).found
     assert isinstance(found, PoseMeasurement)
     unstated, common = replace(found, unstated=True), replace(found, shared=1e-4 * np.eye(6))
@@ -333,10 +342,67 @@ def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
 @given(share=st.floats(0.5, 1.5))
 def test_the_stated_error_of_the_rig_explains_its_difference(share: float) -> None:
     """95 % along any axis is 1.43 times as much for a distance in space."""
-    monitor, error = PoseMonitor(0.003, 0.01), 0.003 + share * 0.01 * 2.7955 / 1.96
+    monitor, error = PoseMonitor(_RIG.anchors, 0.003, 0.01), 0.003 + share * 0.01 * 2.7955 / 1.96
     found = seen_at(FrameRequest(0, 0.0, 0.0, None), error, deviation=1e-6).found
     assert isinstance(found, PoseMeasurement)
     assert any(monitor.take(found, HERE) for _ in range(10)) == (share > 1.0 + 1e-6)
+
+
+@given(axis=st.sampled_from(np.eye(3).tolist()), degrees=st.floats(0.5, 6.0))
+def test_a_platform_rotated_about_its_origin_differs_where_an_anchor_is_too_far_off(
+    axis: list[float], degrees: float
+) -> None:
+    monitor, turn = PoseMonitor(_RIG.anchors, 0.003, 0.0), np.radians(degrees) * np.array(axis)
+    rotated = Pose(HERE.position, matrix_from_rotation_vector(turn))
+    found = replace(
+        seen_at(FrameRequest(0, 0.0, 0.0, None), deviation=1e-6).found,
+        pose=rotated,
+        covariance=1e-12 * np.eye(6),
+    )
+    off = np.linalg.norm(_RIG.anchors @ (rotated.rotation - np.eye(3)).T, axis=1).max()
+    texts = [monitor.take(found, HERE) for _ in range(10)]
+    assert bool(texts[-1]) == (off > 0.00301)
+    if off > 0.00301:
+        assert f"0.0 mm and {degrees:.1f} deg from its encoder pose" in texts[-1]
+
+
+def test_poses_between_images_follow_a_curve() -> None:
+    """A circle at 300 mm/s, seen twice a second: the chord between two images is 18 mm off."""
+
+    def on_circle(time: float) -> Pose:
+        angle = 2.0 * time
+        offset = 0.15 * np.array([np.cos(angle), np.sin(angle), 0.0])
+        return Pose(HERE.position + offset, HERE.rotation)
+
+    reported = {}
+    for between in (1, 5):
+        camera = Moving("front", [0], 0.15, on_circle)
+        run: Any = RunCameras([CameraClient(camera, "here")], MODEL, 0.0, RATE)
+        reported[between] = []
+        for k in range(20 * 5):
+            time = k / 10.0
+            if k % 5 == 0:
+                run.trigger(time, time, None, on_circle(time))
+            elif between == 1:
+                run.drive(time, None, on_circle(time))
+            reported[between] += run.news()
+    assert not reported[1]
+    assert [news.code for news in reported[5]] == ["pose_differs"]
+
+
+@pytest.mark.parametrize("wrong", ["front", "side", "both"])
+def test_each_camera_off_the_encoder_pose_is_named_where_they_disagree(wrong: str) -> None:
+    shifts = {"front": 0.03, "side": -0.03}
+    eyes = [
+        CameraClient(Scripted(n, [0], s if wrong in (n, "both") else 0.0), "here")  # type: ignore[arg-type]
+        for n, s in shifts.items()
+    ]
+    run, reported = RunCameras(eyes, MODEL, 0.0, RATE), []
+    for k in range(15):
+        run.trigger(k / RATE, k / RATE, None, HERE)
+        reported += [news.text for news in run.news() if news.code == "pose_differs"]
+    named = [name for name in shifts if wrong in (name, "both")]
+    assert [text.split(" measured")[0] for text in reported] == [f"camera {n}" for n in named]
 
 
 #: Each frame of a camera: what it measures beside the truth along x, [mm]; None without a pose.
