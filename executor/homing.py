@@ -136,7 +136,7 @@ def home(
         listener: Receives progress.
         confirm: Called once, before anything moves; False cancels it. Without it the call itself
             confirms the motion.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
 
     Raises:
         BadInput: An argument cannot be used.

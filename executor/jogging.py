@@ -85,7 +85,7 @@ def jog(
         listener: Receives progress.
         confirm: Called once, before anything moves; False cancels it.
         on_event: Receives each event of the run.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
 
     Raises:
         CdprError: As for `executor.runner.run`; or the straight path is too long or not free.
@@ -303,7 +303,7 @@ def jog_cable(
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
         confirm: Called once, before anything moves; False cancels it.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
 
     Raises:
         BadInput: There is no such cable, the length is zero, or an argument is of another type.

@@ -91,7 +91,8 @@ def run(
     """Checks a plan, computes its set-points, arms the drives, moves, measures and reports.
 
     On the interface ``virtual`` drives, platform and camera are simulated in this process. `cdpr
-    stop` and, in the main thread, Ctrl-C stop all drives together along the path, which then hold.
+    stop` and, in the main thread, Ctrl-C and any other exception of a signal handler stop all
+    drives together along the path, which then hold.
 
     Args:
         plan: The plan.
@@ -110,7 +111,7 @@ def run(
         on_event: Receives each event of the run. It is called by the thread that supervises the
             motion and must return at once. An exception stops and fails the run;
             `KeyboardInterrupt` and `SystemExit` stop it as Ctrl-C does.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
         plan_file: Name of the plan in messages.
 
     Returns:
@@ -123,7 +124,8 @@ def run(
         HardwareMissing: A drive or a camera does not answer; nothing moved.
         Fault: A process of the program failed before anything moved.
         StoppedByOperator: Cancelled before anything moved.
-        KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written.
+        KeyboardInterrupt: Ctrl-C, after the drives stopped together and the record was written; so
+            is the first exception of any other signal handler.
     """
     require_types((plan, Plan), (rig, Rig), (listener, Listener), optional=[(start, Pose)])
     require_functions(confirm=confirm, on_event=on_event)
@@ -207,6 +209,7 @@ class _Run:
         outcome: Of the motion.
         seen: Camera records.
         troubles: Missing data, and what a function of the caller raised late, a sentence each.
+        result: The verdict, once the files are written.
     """
 
     prepared: PreparedRun
@@ -222,6 +225,7 @@ class _Run:
     outcome: Outcome | None = None
     seen: CameraRecords | None = None
     troubles: list[str] = field(default_factory=list)
+    result: RunResult | None = None
 
     def __post_init__(self) -> None:
         rig, fast = self.prepared.rig, not self.options.realtime
@@ -238,8 +242,8 @@ class _Run:
             folder.write_rig(self.prepared.rig.document)
             folder.write_course(self.course)
             with folder.held():
-                self._move_and_measure()
-                result = self.commands.supervisor.conclude(self._conclude)
+                board, moves = self.commands.board, self._move_and_measure
+                self.commands.supervisor.during(board, moves, self._conclude)
         except StoppedByOperator:
             self.callbacks.leave()
             raise
@@ -248,12 +252,13 @@ class _Run:
             if not self.begun:
                 folder.discard()
         self.callbacks.leave()
-        return result
+        assert self.result is not None
+        return self.result
 
     def _move_and_measure(self) -> None:
         """Moves and takes images; a failure of the motion once begun is part of the outcome."""
         try:
-            self.commands.supervisor.during(self.commands.board, self._with_listeners)
+            self._with_listeners()
         except Exception as error:
             if not self.begun or self.recorder is None:
                 raise
@@ -344,7 +349,7 @@ class _Run:
             if self.outcome is None:
                 raise
 
-    def _conclude(self) -> RunResult:
+    def _conclude(self) -> None:
         """Computes the verdict, reports it, then writes the result files."""
         outcome, supervisor = self.outcome, self.commands.supervisor
         assert outcome is not None
@@ -361,7 +366,7 @@ class _Run:
             self.listener.warning(f"{self.callbacks.error}; the verdict does not depend on it")
         has_report = evaluated is not None and REPORT not in missing
         report = self.folder.report if has_report else None
-        return RunResult(self.folder.path, summary, missing, report)
+        self.result = RunResult(self.folder.path, summary, missing, report)
 
     def _course(self, outcome: Outcome) -> RunCourse:
         """The course with the end of the motion."""

@@ -389,7 +389,7 @@ def release(
         listener: Receives what the system denies, and remarks on the drives.
         confirm: Called once, before anything is released; False cancels it. Without it the call
             itself confirms.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
 
     Raises:
         StoppedByOperator: Cancelled, or stopped.

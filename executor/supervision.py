@@ -268,18 +268,24 @@ def _belongs_to_event_loop(handler: object) -> bool:
     return str(module).partition(".")[0] in _EVENT_LOOPS
 
 
+#: Signals of which the handlers may raise one right after the other, as where all were pending.
+_AT_ONCE = 8
+
+
 class Supervisor:
     """Turns an interrupt of the calling program into a coordinated stop.
 
     This one sets no handler, so that the library works from any thread: the motion runs in its
-    own thread, and a `KeyboardInterrupt` in the calling thread requests the stop. It is raised
-    again once the drives hold and the record is written. A program that handles signals itself,
-    as the command line does, overrides the methods.
+    own thread, and what a signal handler raises in the calling thread, such as
+    `KeyboardInterrupt`, requests the stop. The first is raised again once the drives hold and the
+    record is written. A program that handles signals itself, as the command line does, overrides
+    the methods.
     """
 
     def __init__(self) -> None:
         """Not interrupted."""
-        self.interrupted = False
+        self.interruption: BaseException | None = None
+        """The first exception of a signal handler since the motion began."""
         self.began: float | None = None
         """Start of the program whose only task is the motion, [s] of `CLOCK_BOOTTIME`, if it is
         one: a stop requested since then applies."""
@@ -290,61 +296,62 @@ class Supervisor:
         Without an interruption the preparation ends at its next step.
         """
 
-    def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
-        """Runs a motion, from the opening of its devices to the last image.
+    def during(
+        self,
+        board: RequestBoard,
+        motion: Callable[[], _T],
+        conclude: Callable[[], object] = lambda: None,
+    ) -> _T:
+        """Runs a motion, from the opening of its devices to the last image, and concludes it.
 
         Args:
             board: Takes requests to stop.
             motion: Called once.
+            conclude: Called after the motion: computes its verdict, and writes its record.
 
         Raises:
-            KeyboardInterrupt: Interrupted, and stopped before there was a result.
+            BaseException: What a signal handler raised; stopped before there was a result.
         """
-        thread = _Work("cdpr-motion", motion)
+
+        def whole() -> _T:
+            result = motion()
+            conclude()
+            return result
+
+        self.interruption = None
+        work = _Work("cdpr-motion", whole)
+        self._outlast(work, board.ask_stop, _AT_ONCE)
+        if not work.was_called and self.interruption is not None:
+            raise self.interruption
+        work.join()
         try:
-            thread.start()
-        except KeyboardInterrupt:
-            if thread.cancel():
-                raise
-            self._interrupt(board.ask_stop)
-        self._wait_for(thread, board.ask_stop)
-        try:
-            result: _T = thread.result()
+            result: _T = work.result()
         except StoppedByOperator as error:
-            if self.interrupted:
-                raise KeyboardInterrupt from error
+            if self.interruption is not None:
+                raise self.interruption from error
             raise
         return result
 
-    def conclude(self, work: Callable[[], _T]) -> _T:
-        """Computes the verdict of a motion and writes its record; no interrupt ends that.
+    def _outlast(self, work: _Work, ask_stop: Callable[[], None], layers: int) -> None:
+        """Starts the work and waits for its end, whatever signal handlers raise meanwhile.
 
-        Args:
-            work: Called once.
+        Python may call handlers at every call and jump, also of this loop; an outer layer takes
+        what one raises there.
         """
-        thread = _Work("cdpr-record", work)
-        try:
-            thread.start()
-        except KeyboardInterrupt:
-            self._interrupt()
-            if thread.cancel():  # interrupted before it began
-                return work()
-        self._wait_for(thread)
-        result: _T = thread.result()
-        return result
-
-    def _wait_for(self, thread: _Work, on_interrupt: Callable[[], None] = lambda: None) -> None:
-        # An interrupted `join` may regard the thread as ended (Python 3.11); the event does not.
-        while not thread.is_done.is_set():
+        while not work.is_over:
             try:
-                thread.is_done.wait()
-            except KeyboardInterrupt:
-                self._interrupt(on_interrupt)
-        thread.join()
-
-    def _interrupt(self, do: Callable[[], None] = lambda: None) -> None:
-        self.interrupted = True
-        do()
+                if layers:
+                    self._outlast(work, ask_stop, layers - 1)
+                    continue
+                if self.interruption is None:
+                    work.start()
+                else:
+                    ask_stop()
+                    work.cancel()
+                work.wait()
+            except BaseException as error:  # no call and no jump here
+                if self.interruption is None:
+                    self.interruption = error
 
     def on_motion(self) -> None:
         """Called when armed: the platform is about to move."""
@@ -364,41 +371,54 @@ class Supervisor:
         """Called at the end.
 
         Raises:
-            KeyboardInterrupt: There was one since the motion began.
+            BaseException: The first that a signal handler raised since the motion began.
         """
-        if self.interrupted:
-            raise KeyboardInterrupt
+        if self.interruption is not None:
+            raise self.interruption
 
 
 class _Work(threading.Thread):
-    """A function in a thread, with its result or error."""
+    """A function in a thread, with its result or error.
+
+    Attributes:
+        was_called: The function was called.
+        is_over: It has ended, or will never be called.
+    """
 
     def __init__(self, name: str, function: Callable[[], Any]) -> None:
         super().__init__(name=name)
         self._function = function
         self._result: Any = None
         self._error: BaseException | None = None
-        self._lock = threading.Lock()
-        self.is_done = threading.Event()
-        self._begun = self._cancelled = False
+        self._has_begun = self._is_cancelled = False
+        self.was_called = self.is_over = False
+        # Compiled, unlike `Event`, in which a second exception may replace the first.
+        # An interrupted `join` may regard the thread as ended (Python 3.11).
+        self._end = threading.Lock()
+        self._end.acquire()
 
     def run(self) -> None:
-        with self._lock:
-            self._begun = not self._cancelled
-        if not self._begun:
-            return
+        self._has_begun = True
         try:
-            self._result = self._function()
+            if not self._is_cancelled:
+                self.was_called = True
+                self._result = self._function()
         except BaseException as error:
             self._error = error
         finally:
-            self.is_done.set()
+            self.is_over = True
+            self._end.release()
 
-    def cancel(self) -> bool:
-        """Prevents the call of the function; False if it has begun."""
-        with self._lock:
-            self._cancelled = True
-            return not self._begun
+    def cancel(self) -> None:
+        """Prevents the call of the function, unless the thread has begun."""
+        self._is_cancelled = True  # before it looks; the thread does both in reverse
+        if not self._has_begun:
+            self.is_over = True
+
+    def wait(self) -> None:
+        """Waits until it is over."""
+        if not self.is_over:
+            self._end.acquire()
 
     def result(self) -> Any:
         if self._error is not None:

@@ -100,7 +100,8 @@ def move_by_law(
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
-        KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
+        KeyboardInterrupt: Ctrl-C stopped it, as does another signal handler's exception; the
+            drives hold.
         CdprError: Nothing was enabled.
     """
 
@@ -133,7 +134,8 @@ def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) ->
     Raises:
         Fault: It ended with a fault, which is latched; with its cause.
         StoppedByOperator: The operator stopped it.
-        KeyboardInterrupt: Ctrl-C stopped it; the drives hold.
+        KeyboardInterrupt: Ctrl-C stopped it, as does another signal handler's exception; the
+            drives hold.
     """
     supervisor = commands.supervisor
     commands.require_no_stop()

@@ -77,7 +77,7 @@ def jog_session(
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
         confirm: Called once, before anything is enabled; False cancels it.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
         on_cycle: Called after every cycle with the board of presses and the checked line, for
             programs that hold controls themselves.
 
@@ -136,7 +136,7 @@ def cable_session(
         realtime: As for `executor.runner.run`, like all up to the supervisor.
         need_real_time_rights: Refuse to enable drives on a bus without real-time scheduling.
         confirm: Called once, before anything is enabled; False cancels it.
-        supervisor: Turns interrupts into stops; None for `KeyboardInterrupt`.
+        supervisor: Turns interrupts into stops; None for what signal handlers raise.
         on_cycle: Called after every cycle with the board of presses and the cable travel, for
             programs that hold controls themselves.
 

@@ -277,7 +277,7 @@ def commands_from_start(
     Args:
         verb: Its name on the command line.
         rig: The robot and its bus.
-        supervisor: Of the program; None for `KeyboardInterrupt`.
+        supervisor: Of the program; None for what signal handlers raise.
         realtime: Whether the motion has a process of its own, which shares the board.
 
     Raises:

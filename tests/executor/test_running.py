@@ -655,7 +655,7 @@ def test_ctrl_c_in_a_coroutine_stops_a_motion(folders, realtime):
 
     with pytest.raises(KeyboardInterrupt):
         asyncio.run(main())
-    assert supervisor.interrupted
+    assert isinstance(supervisor.interruption, KeyboardInterrupt)
 
 
 #: A program at a question to its operator.

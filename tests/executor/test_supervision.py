@@ -1,9 +1,10 @@
-"""Ctrl-C in a program that calls the library stops the motion, and is not lost."""
+"""What a signal raises in a program that calls the library stops the motion, and is not lost."""
 
 from __future__ import annotations
 
 import asyncio
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -11,10 +12,36 @@ from typing import Any
 
 import pytest
 
-from executor.supervision import LocalRequests, Supervisor, ctrl_c_interrupts
+from executor.supervision import LocalRequests, Supervisor, _Work, ctrl_c_interrupts
 from model.errors import StoppedByOperator
 
 PATIENCE_S = 20.0
+#: What handlers of a program raise, by signal: those of Ctrl-C, a service, pytest-timeout.
+RAISED: dict[signal.Signals, BaseException] = {
+    signal.SIGINT: KeyboardInterrupt(),
+    signal.SIGTERM: SystemExit(3),
+    signal.SIGALRM: TimeoutError("too long"),
+    signal.SIGHUP: GeneratorExit(),
+    signal.SIGUSR1: StoppedByOperator("by a handler"),
+}
+
+
+@pytest.fixture
+def raising() -> Iterator[None]:
+    """Handlers of a program that raise."""
+
+    def raise_it(number: int, _frame: object) -> None:
+        raise RAISED[signal.Signals(number)].with_traceback(None)
+
+    before = {number: signal.signal(number, raise_it) for number in RAISED}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def interrupt(*numbers: signal.Signals) -> None:
+    for number in numbers:
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
 def until_stopped(board: LocalRequests, then: Callable[[], str]) -> Callable[[], str]:
@@ -22,50 +49,135 @@ def until_stopped(board: LocalRequests, then: Callable[[], str]) -> Callable[[],
     ended = threading.Event()
 
     def motion() -> str:
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        while not board.read().stop:
-            ended.wait(0.01)
-        return then()
+        for _ in range(round(1000 * PATIENCE_S)):
+            if board.read().stop:
+                return then()
+            ended.wait(0.001)
+        raise AssertionError("no stop was requested")
 
     return motion
 
 
-def test_an_interrupt_asks_for_a_stop_and_the_result_is_kept() -> None:
+def interrupted(board: LocalRequests, *numbers: signal.Signals) -> Callable[[], str]:
+    """Such a motion, during which signals arrive at once."""
+    stopped = until_stopped(board, lambda: "held")
+
+    def motion() -> str:
+        interrupt(*numbers)
+        return stopped()
+
+    return motion
+
+
+@pytest.mark.parametrize("number", list(RAISED))
+def test_an_interrupt_asks_for_a_stop_and_the_result_is_kept(
+    raising: None, number: signal.Signals
+) -> None:
     board, supervisor = LocalRequests(), Supervisor()
-    assert supervisor.during(board, until_stopped(board, lambda: "held")) == "held"
-    assert supervisor.interrupted
-    with pytest.raises(KeyboardInterrupt):
+    assert supervisor.during(board, interrupted(board, number)) == "held"
+    with pytest.raises(type(RAISED[number])) as caught:
         supervisor.finish()
+    assert caught.value is RAISED[number]
 
 
-def test_an_interrupt_before_there_is_a_result_stays_an_interrupt() -> None:
+@pytest.mark.parametrize("number", list(RAISED))
+def test_an_interrupt_before_there_is_a_result_stays_an_interrupt(
+    raising: None, number: signal.Signals
+) -> None:
     board = LocalRequests()
 
     def stopped() -> str:
+        interrupt(number)
+        until_stopped(board, str)()
         raise StoppedByOperator("stopped before anything moved")
 
-    with pytest.raises(KeyboardInterrupt):
-        Supervisor().during(board, until_stopped(board, stopped))
+    with pytest.raises(type(RAISED[number])) as caught:
+        Supervisor().during(board, stopped)
+    assert caught.value is RAISED[number]
+
+
+def test_signals_that_follow_each_other_do_not_end_the_wait(raising: None) -> None:
+    """Each is at first pending, so that its handler raises where the one before is caught."""
+    for first in RAISED:
+        board, supervisor = LocalRequests(), Supervisor()
+        others = [number for number in RAISED if number is not first]
+        moves, taken = interrupted(board, first), threading.Event()
+
+        def conclude(taken: threading.Event = taken, others: Any = others) -> None:
+            for _ in range(20):
+                interrupt(*others)
+                taken.wait(0.0005)
+
+        assert supervisor.during(board, moves, conclude) == "held"
+        assert supervisor.interruption is RAISED[first]
+        board = LocalRequests()
+        assert supervisor.during(board, interrupted(board, first, *others)) == "held"
+        assert supervisor.interruption in RAISED.values()
 
 
 def test_an_interrupt_does_not_end_the_writing_of_the_record() -> None:
-    supervisor, went_on = Supervisor(), threading.Event()
+    board, supervisor, written = LocalRequests(), Supervisor(), []
 
-    def record() -> str:
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
-        assert went_on.wait(PATIENCE_S)
-        return "written"
+    def record() -> None:
+        interrupt(signal.SIGINT)
+        written.append(until_stopped(board, lambda: "written")())
 
-    interrupt = supervisor._interrupt
-
-    def interrupted(*arguments: object) -> None:
-        interrupt(*arguments)  # type: ignore[arg-type]
-        went_on.set()
-
-    supervisor._interrupt = interrupted  # type: ignore[method-assign]
-    assert supervisor.conclude(record) == "written"
+    assert supervisor.during(board, lambda: "held", record) == "held"
+    assert written == ["written"]
     with pytest.raises(KeyboardInterrupt):
         supervisor.finish()
+
+
+class Injected:
+    """Raises at one step of the supervisor's code in this thread, of each instruction of it."""
+
+    def __init__(self, at: int) -> None:
+        self.at, self.steps = at, 0
+
+    def __call__(self, frame: Any, event: str, _argument: object) -> Any:
+        if frame.f_globals.get("__name__") != Supervisor.__module__:
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            self.steps += 1
+            if self.steps == self.at:
+                raise TimeoutError("injected")
+        return self
+
+
+def test_an_exception_at_any_instruction_leaves_no_motion_behind(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It requests a stop, prevents the motion, or comes after its end."""
+    wait, tracer, waited = _Work.wait, sys.gettrace(), []
+
+    def noted(work: _Work) -> None:
+        waited.append(trace.steps)
+        wait(work)
+
+    monkeypatch.setattr(_Work, "wait", noted)
+    at, last = 0, 10**6
+    while at <= last:
+        trace, board, supervisor, moving = Injected(at), LocalRequests(), Supervisor(), [False]
+
+        def motion(board: LocalRequests = board, moving: list[bool] = moving, at: int = at) -> str:
+            moving[0] = True
+            if 0 < at <= waited[0]:
+                until_stopped(board, str)()
+            moving[0] = False
+            return "held"
+
+        try:
+            sys.settrace(trace)
+            supervisor.during(board, motion)
+        except TimeoutError:
+            pass
+        finally:
+            sys.settrace(tracer)
+        assert not moving[0], f"at step {at} of {last}"
+        last = trace.steps if at == 0 else last
+        at += 1
+    assert last > waited[0] > 100
 
 
 def test_an_error_of_the_motion_is_the_callers() -> None:

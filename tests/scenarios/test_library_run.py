@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import os
 import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from multiprocessing import current_process
@@ -116,6 +118,41 @@ def test_ctrl_c_in_a_script_ends_in_a_coordinated_stop_that_is_on_record(
     folder = RunFolder.open(tmp_path / "run")
     assert folder.summary()["verdict"] == "STOPPED"
     assert folder.report.is_file()
+    MotionInterlock(rig).require_free()
+
+
+@pytest.mark.parametrize("code", ["enabled", "moving"])
+@pytest.mark.parametrize("error", [SystemExit(3), TimeoutError("too long")])
+def test_what_another_signal_handler_raises_stops_the_run_and_keeps_its_record(
+    plan: Plan, slow_rig: Path, tmp_path: Path, error: BaseException, code: str
+) -> None:
+    """Also one that `except Exception` would catch, and where a second signal follows."""
+
+    def leave(number: int, _frame: object) -> None:
+        raise error if number == signal.SIGALRM else KeyboardInterrupt
+
+    def press(event: RunEvent) -> None:
+        main = threading.main_thread().ident or 0
+        if event.code == code:
+            signal.pthread_kill(main, signal.SIGALRM)
+        elif event.code == "stop":
+            signal.pthread_kill(main, signal.SIGTERM)
+
+    rig, run = load_rig(slow_rig), tmp_path / "run"
+    before = {n: signal.signal(n, leave) for n in (signal.SIGALRM, signal.SIGTERM)}
+    try:
+        with pytest.raises(type(error)) as caught:
+            runner.run(plan, rig, folder=run, cameras=(), realtime=False, on_event=press)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert caught.value is error
+    folder = RunFolder.open(run)
+    assert folder.summary()["verdict"] == "STOPPED"
+    assert folder.report.is_file()
+    for line in (run / "SHA256SUMS").read_text().splitlines():
+        digest, name = line.split()
+        assert hashlib.sha256((run / name).read_bytes()).hexdigest() == digest
     MotionInterlock(rig).require_free()
 
 

@@ -124,10 +124,17 @@ class SignalSupervisor(Supervisor):
         assert main is not None
         signal.pthread_kill(main, signal.SIGINT)
 
-    def during(self, board: RequestBoard, motion: Callable[[], _T]) -> _T:
+    def during(
+        self,
+        board: RequestBoard,
+        motion: Callable[[], _T],
+        conclude: Callable[[], object] = lambda: None,
+    ) -> _T:
         """See `Supervisor`."""
         with stop_requests(board):
-            return motion()
+            result = motion()
+        conclude()
+        return result
 
 
 class RunSupervisor(SignalSupervisor):
@@ -162,10 +169,6 @@ class RunSupervisor(SignalSupervisor):
     def take_over(self) -> None:
         """Takes over the signals, once the operator agreed to the run."""
         self._signals.enter_context(handling(self._on_signal))
-
-    def conclude(self, work: Callable[[], _T]) -> _T:
-        """See `Supervisor`; signals are handled already."""
-        return work()
 
     def on_motion(self) -> None:
         """See `Supervisor`."""
