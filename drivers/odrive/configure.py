@@ -168,6 +168,9 @@ MOST_CYCLES = 5
 """Longest period of positions and torques, [cycles]: a position may belong to any set-point since
 the last one, which delays the detection of a drive that does not follow."""
 
+HEARD_BEFORE = 3
+"""Time without another master before anything is sent, [cycles]."""
+
 OLDEST_FIRMWARE = (0, 6)
 NO_SUPPLY = 1.0
 """Voltage below which the motor supply is off, [V]."""
@@ -202,6 +205,8 @@ def configure_drives(
         read_endpoints(Path(document.endpoints), document, layouts) if document.endpoints else None
     )
     link = SetupLink(bus, pump, layouts, nodes)
+    for _ in link.answers(layouts.heartbeat, HEARD_BEFORE * rig.cycle):
+        pass  # another program that commands a drive is found before anything is sent
     _check_versions(link, layouts, nodes, document, known)
     _check_idle(link, layouts, nodes, document, to_reset)
     _check_supply(link, layouts, nodes)

@@ -7,6 +7,7 @@ import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +38,7 @@ from executor.doctor import rig_drives
 from model.errors import BadInput, Fault, HardwareMissing, Refused
 from model.files.rig_file import OdriveDocument
 from model.rig import Rig, rig_from_document
+from simulation.drives.odrive import SimulatedOdrive
 from tests.drivers.odrive_bench import OdriveBench, odrive_bench, odrive_rig, write_endpoints
 
 SET_AXIS_STATE, SET_INPUT_POS, GET_IQ = 0x07, 0x0C, 0x14
@@ -548,9 +550,11 @@ def test_another_program_that_only_reads_is_no_fault(
 def test_another_program_that_commands_during_configuration_is_a_fault(
     bench: OdriveBench, name: str
 ) -> None:
+    """Before anything is sent: in some firmware every frame to a drive feeds its watchdog."""
     other_program(bench, 0x3F, *COMMANDED[name])
     with pytest.raises(Fault, match=rf"another program commands all drives \({name}\)"):
         bench.group.configure()
+    assert not any(frame.is_remote_frame for frame in bench.frames())
 
 
 def test_where_the_master_hears_itself_its_own_frames_are_not_anothers(
@@ -689,6 +693,12 @@ def test_a_drive_that_reports_its_version_on_its_own_is_refused_by_that_setting(
     assert "set version_msg_rate_ms to 0" in caught.value.next_step
 
 
+def left_enabled(drive: SimulatedOdrive) -> None:
+    """By a master that is gone; its watchdog is off."""
+    drive.settings = replace(drive.settings, watchdog=None)
+    drive.state = AxisState.CLOSED_LOOP_CONTROL
+
+
 REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]] = {
     "silent": (lambda b: setattr(b.drives[1], "deaf", True), HardwareMissing, "drive 2: no"),
     "firmware 0.5": (
@@ -715,7 +725,7 @@ REFUSED: dict[str, tuple[Callable[[OdriveBench], object], type[Exception], str]]
         "firmware 0.5.6 is too old",
     ),
     "already enabled": (
-        lambda b: setattr(b.drives[1], "state", AxisState.CLOSED_LOOP_CONTROL),
+        lambda b: left_enabled(b.drives[1]),
         Refused,
         "drive 2 is already enabled",
     ),
