@@ -168,6 +168,7 @@ def open_bus(settings: BusSettings) -> can.BusABC:
     except OSError as error:
         bus.shutdown()
         raise _cannot_open(settings, error) from error
+    bus.channel_info = str(settings)  # names it in messages; some back ends set none
     return bus
 
 

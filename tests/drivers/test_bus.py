@@ -7,13 +7,15 @@ import gc
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import can
 import pytest
 from can.interfaces.udp_multicast import bus as udp_bus
 
-from drivers import can_interfaces
+from drivers import can_bus, can_interfaces
 from drivers.can_bus import BusSettings, InProcessBus, SentFrame, open_bus
+from drivers.can_errors import bus_text
 from drivers.can_interfaces import KernelInterface
 from drivers.can_load import bus_load, check_bus_load, cycle_bits, heartbeat_cycles
 from model.errors import BadInput, HardwareMissing, Refused
@@ -209,6 +211,13 @@ def test_a_udp_channel_that_is_no_multicast_address_is_refused(channel: str) -> 
 
 def test_a_udp_bus_may_have_an_ipv6_group() -> None:
     assert BusSettings("udp_multicast", "ff15::17").canonical == "udp_multicast ff15::17:43113"
+
+
+def test_messages_name_a_udp_bus_as_the_rig_file_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp_bus, "GeneralPurposeUdpMulticastBus", Mock())
+    monkeypatch.setattr(can_bus, "_prepare_socket", lambda _bus: None)
+    with open_bus(BusSettings("udp_multicast", "239.74.163.11:43811")) as bus:
+        assert bus_text(bus) == "bus udp_multicast 239.74.163.11:43811"
 
 
 def test_a_bus_that_did_not_open_is_not_said_to_be_left_open(
