@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +23,7 @@ from model.pose import (
 )
 
 if TYPE_CHECKING:
+    from model.rig import Rig
     from tracking.pnp import BundlePose, TagView
 
 MOST_TURN = math.radians(80.0)
@@ -318,6 +319,26 @@ def rejection_reason(
 def edge_count(views: Sequence[TagView]) -> int:
     """Number of measured edges."""
     return sum(int(view.seen.edges.sum()) for view in views)
+
+
+# Comparison of cameras, of which the sources may be exchanged.
+
+
+def pose_gap(a: Pose, b: Pose) -> float:
+    """Distance of two poses, 1 at 50 mm or 2°: errors of a rig file explain no more."""
+    return max(a.distance_to(b) / 0.05, float(np.degrees(a.angle_to(b))) / 2.0)
+
+
+def exchanged_cameras(rig: Rig, found: Mapping[str, Observation]) -> tuple[str, str] | None:
+    """Two cameras whose poses of the platform agree only if their images are exchanged."""
+    poses = {name: one.pose for name, one in found.items() if isinstance(one, PoseMeasurement)}
+    for one, other in combinations((c for c in rig.cameras if c.name in poses), 2):
+        a, b = poses[one.name], poses[other.name]
+        other_from_one = other.world_from_camera.compose(one.world_from_camera.inverse())
+        by_other, by_one = other_from_one.compose(a), other_from_one.inverse().compose(b)
+        if pose_gap(a, b) > 1.0 >= pose_gap(by_other, by_one):
+            return one.name, other.name
+    return None
 
 
 # Comparison with the encoders along a run.

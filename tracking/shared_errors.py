@@ -30,6 +30,7 @@ from tracking.camera_model import (
 )
 from tracking.clearance import missing_errors
 from tracking.detection.tags import mounted_rotated, tag_corners
+from tracking.measurement import pose_gap
 from tracking.pnp import (
     HUBER,
     BundlePose,
@@ -428,8 +429,3 @@ def require_unmoved_camera(
             why, next_step = exchanged_sources(camera.name, nearest)
     where = f"frame tags {values['frame_tags']}"
     raise CameraMoved(what, where=where, why=why, next_step=next_step, values=values)
-
-
-def pose_gap(a: Pose, b: Pose) -> float:
-    """Distance of two poses, 1 at 50 mm or 2°: errors of a rig file explain no more."""
-    return max(a.distance_to(b) / 0.05, float(np.degrees(a.angle_to(b))) / 2.0)

@@ -31,9 +31,10 @@ from tracking.measurement import (
     UNSHARP,
     Observation,
     PoseMeasurement,
+    exchanged_cameras,
 )
 from tracking.pose_log import LoggedImage
-from tracking.shared_errors import PERHAPS_MOVED, pose_gap
+from tracking.shared_errors import PERHAPS_MOVED
 from tracking.tracker import Tracker
 
 
@@ -309,18 +310,6 @@ def track_cameras(
             why=why,
             next_step=next_step,
         )
-
-
-def exchanged_cameras(rig: Rig, found: Mapping[str, Observation]) -> tuple[str, str] | None:
-    """Two cameras whose poses of the platform agree only if their images are exchanged."""
-    poses = {name: one.pose for name, one in found.items() if isinstance(one, PoseMeasurement)}
-    for one, other in combinations((c for c in rig.cameras if c.name in poses), 2):
-        a, b = poses[one.name], poses[other.name]
-        other_from_one = other.world_from_camera.compose(one.world_from_camera.inverse())
-        by_other, by_one = other_from_one.compose(a), other_from_one.inverse().compose(b)
-        if pose_gap(a, b) > 1.0 >= pose_gap(by_other, by_one):
-            return one.name, other.name
-    return None
 
 
 def _seeing(

@@ -23,9 +23,9 @@ from tracking.measurement import (
     Observation,
     PoseMeasurement,
     PoseMonitor,
+    exchanged_cameras,
     rates,
 )
-from tracking.track import exchanged_cameras
 
 # Fusion of several cameras, and monitors of what they measure.
 
