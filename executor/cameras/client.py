@@ -61,6 +61,19 @@ class CameraHealth:
         return ""
 
 
+@dataclass(frozen=True, slots=True)
+class CameraNews:
+    """A condition of a camera for the operator.
+
+    Attributes:
+        code: Of the event, such as ``camera`` or ``camera_sees_nothing``.
+        text: One sentence.
+    """
+
+    code: str
+    text: str
+
+
 class CameraClient:
     """Requests images from one camera and stores its samples."""
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from executor.cameras.client import BLIND_IMAGES, CameraClient
+from executor.cameras.client import BLIND_IMAGES, CameraClient, CameraNews
 from executor.cameras.process import CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from executor.remote.status import RunStatus
@@ -19,8 +19,8 @@ from model.progress import SILENT, Listener
 from tracking.clearance import ClearanceMonitor, MeasuredClearance, clearance_of
 from tracking.fusion import MultiCameraFusion
 from tracking.measurement import (
-    EncoderPoses,
     Observation,
+    PoseHistory,
     PoseMeasurement,
     PoseMonitor,
     exchanged_cameras,
@@ -28,19 +28,6 @@ from tracking.measurement import (
 )
 
 # Fusion of several cameras, and monitors of what they measure.
-
-
-@dataclass(frozen=True, slots=True)
-class CameraNews:
-    """A condition of a camera for the operator.
-
-    Attributes:
-        code: Of the event, such as ``camera`` or ``camera_sees_nothing``.
-        text: One sentence.
-    """
-
-    code: str
-    text: str
 
 
 class MultiCameraMonitor:
@@ -67,7 +54,7 @@ class MultiCameraMonitor:
         # Of the fused pose ("") and of each camera: fusion with a poor one must not hide what a
         # good one measures, and if they disagree, the correct one is unknown.
         self._watches = {name: ClearanceMonitor(limit) for name in ("", *names)}
-        self._encoders, motion = EncoderPoses(), model.rig.motion
+        self.history, motion = PoseHistory(), model.rig.motion
         tolerance = motion.start_tolerance + motion.following_error
         self._poses = {
             name: PoseMonitor(model.rig.anchors, tolerance, model.rig.platform_error or 0.0)
@@ -106,10 +93,6 @@ class MultiCameraMonitor:
         if isinstance(sample.found, PoseMeasurement):
             self._watch(name, sample.found)
 
-    def drive(self, time: float, encoder_pose: Pose | None) -> None:
-        """Takes the platform pose from the encoders at a time since the start of the run, [s]."""
-        self._encoders.add(time, encoder_pose)
-
     def finish(self) -> None:
         """Reports images left out because they were too far apart in time, and unequal clocks."""
         self.news += [CameraNews("remark", text) for text in self._common.clock_remarks()]
@@ -126,7 +109,7 @@ class MultiCameraMonitor:
         near = self._watches[name].take(clearance)
         if near and not self.near:
             self.near = near + (f", measured by camera {name} alone" if name else "")
-        off = self._poses[name].take(found, self._encoders.at(found.time))
+        off = self._poses[name].take(found, *self.history.at(found.time))
         if off and "" not in self._differ:
             self._differ.add(name)
             who = f"camera {name}" if name else "the cameras" if self._several else "the camera"
@@ -225,7 +208,12 @@ class RunCameras:
         return "all cameras failed: " + "; ".join(f"{name}: {why}" for name, why in failed.items())
 
     def trigger(
-        self, time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None
+        self,
+        time: float,
+        asked: float,
+        true_pose: Pose | None,
+        encoder_pose: Pose | None,
+        planned: Pose | None = None,
     ) -> None:
         """Collects samples, and requests an image of the present time.
 
@@ -234,9 +222,10 @@ class RunCameras:
             asked: The same time on the monotonic clock, [s].
             true_pose: Of the simulated platform; None with real cameras.
             encoder_pose: Platform pose from the encoders; None if unknown.
+            planned: Platform pose of the plan; None beside its path.
         """
         self._now = asked
-        self.drive(time, true_pose, encoder_pose)
+        self.drive(time, true_pose, encoder_pose, planned)
         for client in self._clients:
             self._put(client, client.collect())
         self._process_complete()
@@ -248,11 +237,13 @@ class RunCameras:
         self._frame += 1
         self._report_trouble()
 
-    def drive(self, time: float, true_pose: Pose | None, encoder_pose: Pose | None) -> None:
+    def drive(
+        self, time: float, true: Pose | None, encoder: Pose | None, planned: Pose | None
+    ) -> None:
         """Takes poses between which images are taken; arguments as for `trigger`."""
-        self._common.drive(time, encoder_pose)
-        if true_pose is not None:
-            self._true_poses.append((time, true_pose))
+        self._common.history.add(time, planned, encoder)
+        if true is not None:
+            self._true_poses.append((time, true))
 
     def news(self) -> list[CameraNews]:
         """New conditions since the last call."""
@@ -395,13 +386,14 @@ class CameraWatch:
         asked: float,
         true_pose: Pose | None,
         encoder_pose: Pose | None,
+        planned: Pose | None = None,
         is_due: bool = True,
     ) -> None:
         """Requests an image if one is due; other arguments as for `RunCameras.trigger`."""
         if not is_due:
-            self._cameras.drive(time, true_pose, encoder_pose)
+            self._cameras.drive(time, true_pose, encoder_pose, planned)
             return
-        self._cameras.trigger(time, asked, true_pose, encoder_pose)
+        self._cameras.trigger(time, asked, true_pose, encoder_pose, planned)
         self._report_news(asked)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)

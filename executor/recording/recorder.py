@@ -87,14 +87,16 @@ class RunLog:
         ]
         return np.concatenate(parts) if parts else np.empty(0, self._format)
 
+    def planned_pose(self, record: CycleRecord) -> Pose | None:
+        """Planned pose in a cycle; None beside the path."""
+        return self._checked.table.pose(round(record.index)) if record.state in ON_PATH else None
+
     def encoder_pose(self, record: CycleRecord) -> Pose | None:
         """Platform pose from the encoders in a cycle; None if the positions fit no pose."""
-        planned, row = self._checked.table, round(record.index)
-        cycle = np.array([self._packed(record)], self._format)
+        cycle, row = np.array([self._packed(record)], self._format), round(record.index)
         lengths, _, most_off = self._lengths(cycle, np.array([row]))
         try:
-            guess = Pose(planned.positions[row], planned.rotations[row])
-            found = forward_kinematics(self._rig, lengths[0], guess)
+            found = forward_kinematics(self._rig, lengths[0], self._checked.table.pose(row))
         except Fault:
             return None
         return found.pose if found.worst <= most_off[0] else None
@@ -345,9 +347,9 @@ class RecordWriter:
                 self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
 
 
-#: Takes a pose: time since the start of the run [s], the same time on the monotonic clock [s], true
-#: pose of the simulated platform, encoder pose, and whether an image is due.
-FrameTrigger = Callable[[float, float, Pose | None, Pose | None, bool], None]
+#: Takes poses: time since the start of the run [s], the same time on the monotonic clock [s], true
+#: pose of the simulated platform, encoder pose, planned pose on the path, and if an image is due.
+FrameTrigger = Callable[[float, float, Pose | None, Pose | None, Pose | None, bool], None]
 #: Longest time between these, also where images are rarer: platforms move along curves, [s].
 _BETWEEN_POSES = 0.1
 
@@ -388,8 +390,7 @@ class Recorder:
         self.writer = RecordWriter(folder, self.log, own_thread=own_thread)
         """Writes the record; the caller closes it."""
         self._status = status
-        self._trigger, self._progress = trigger, progress
-        self._every = every
+        self._trigger, self._progress, self._every = trigger, progress, every
         most = max(_BETWEEN_POSES / prepared.checked.table.cycle + 1e-9, 1.0)
         divisors = (k for k in range(1, every + 1) if every % k == 0 and k <= most)
         self.pose_every = max(divisors) if trigger else 0
@@ -425,8 +426,9 @@ class Recorder:
         if record.cycle % self._every == 0:
             self._progress(record.index)
         if self._trigger is not None and record.cycle % self.pose_every == 0:
-            encoder_pose, is_due = self.log.encoder_pose(record), record.cycle % self._every == 0
-            self._trigger(record.at - self._began, record.at, true_pose, encoder_pose, is_due)
+            poses = true_pose, self.log.encoder_pose(record), self.log.planned_pose(record)
+            is_due = record.cycle % self._every == 0
+            self._trigger(record.at - self._began, record.at, *poses, is_due)
         self.writer.take_cycles(record.at)
         if failure is not None:
             raise failure

@@ -137,6 +137,10 @@ class Trajectory:
         """SHA-256 over the set-points and their cycle, recomputed on each call."""
         return fingerprint(self.cycle, self.setpoints)
 
+    def pose(self, row: int) -> Pose:
+        """The executed pose of a row."""
+        return Pose(self.positions[row], self.rotations[row])
+
     def poses(self) -> list[Pose]:
         """The executed poses, one per row."""
         return poses_of(self.positions, self.rotations)
@@ -305,7 +309,7 @@ def _number_violations(rig: Rig, table: Trajectory) -> list[str]:
 def _end_violations(scene: Scene, table: Trajectory) -> list[str]:
     found = []
     for name, pose, row in (("start", scene.start, 0), ("goal", scene.goal, -1)):
-        end = Pose(table.positions[row], table.rotations[row])
+        end = table.pose(row)
         off = end.distance_to(pose)
         if off > 1e-6 or end.angle_to(pose) > 1e-6:
             found.append(

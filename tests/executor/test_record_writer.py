@@ -277,7 +277,8 @@ def recorder_of(
     stops = [{"name": name, "dwell_s": 0.0, **goal} for name in ("one", "two")]
     data = {"schema_version": 1, "name": "s", "start": goal, "goal": goal, "stops": stops}
     scene = scene_from_document(SceneDocument.model_validate(data))
-    table = SimpleNamespace(dwells=(Dwell(0, 0), Dwell(0, 0)), cycle=0.01)
+    dwells = (Dwell(0, 0), Dwell(0, 0))
+    table = SimpleNamespace(dwells=dwells, cycle=0.01, pose=lambda _row: rig.home)
     prepared: Any = SimpleNamespace(rig=rig, scene=scene, checked=SimpleNamespace(table=table))
     recorder = Recorder(
         prepared,
@@ -338,7 +339,7 @@ def test_poses_come_at_least_ten_times_a_second_and_with_every_image(
 ) -> None:
     """Of 10 ms; a camera may take an image only once a second."""
     due: list[bool] = []
-    recorder = recorder_of(folder, [], monkeypatch, every, lambda *given: due.append(given[4]))
+    recorder = recorder_of(folder, [], monkeypatch, every, lambda *given: due.append(given[5]))
     record = cycle_at(0.0, State.READY)
     assert recorder.pose_every == pose_every
     for k in range(2 * every + 1):

@@ -308,7 +308,7 @@ def test_a_platform_off_its_encoder_pose_is_reported_once(
     eyes = [CameraClient(Scripted(name, [0], shift_mm / 1e3), "here") for name in names]  # type: ignore[arg-type]
     run, reported = RunCameras(eyes, MODEL, 0.0, RATE), []
     for k in range(images + 1):
-        run.trigger(k / RATE, k / RATE, None, HERE)
+        run.trigger(k / RATE, k / RATE, None, HERE, HERE)
         reported += [news for news in run.news() if news.code == "pose_differs"]
     if abs(shift_mm) < 3.0 or images < OFF_IMAGES:
         assert not reported
@@ -326,8 +326,22 @@ def test_a_moving_platform_is_compared_with_the_encoders_at_the_time_of_the_imag
     """At 1 m/s, where a whole request apart it would be 100 mm off."""
     run: Any = RunCameras([CameraClient(Moving("front", [1], late), "here")], MODEL, 0.0, RATE)
     for k in range(30):
-        run.trigger(k / RATE, k / RATE, None, at_time(k / RATE) if known else None)
+        planned = at_time(k / RATE) if known else None
+        run.trigger(k / RATE, k / RATE, None, planned, planned)
         assert not run.news()
+
+
+@pytest.mark.parametrize("off", ["planned", "encoder", "both"])
+def test_a_platform_at_its_planned_or_its_encoder_pose_does_not_differ(off: str) -> None:
+    """Drives lag behind a fast path, and wrong tensions shift the encoder pose."""
+    monitor, beside = PoseMonitor(_RIG.anchors, 0.003, 0.0), at_time(0.02)
+    found = seen_at(FrameRequest(0, 0.0, 0.0, None)).found
+    assert isinstance(found, PoseMeasurement)
+    planned, encoder = (
+        beside if off in (name, "both") else HERE for name in ("planned", "encoder")
+    )
+    texts = [monitor.take(found, planned, encoder) for _ in range(12)]
+    assert any(texts) is (off == "both")
 
 
 def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
@@ -335,8 +349,8 @@ def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
     found = seen_at(FrameRequest(0, 0.0, 0.0, None), 0.02).found
     assert isinstance(found, PoseMeasurement)
     unstated, common = replace(found, unstated=True), replace(found, shared=1e-4 * np.eye(6))
-    assert not any(monitor.take(one, HERE) for one in [unstated, common] * 20)
-    assert [bool(monitor.take(found, HERE)) for _ in range(12)] == [k == 9 for k in range(12)]
+    assert not any(monitor.take(one, HERE, HERE) for one in [unstated, common] * 20)
+    assert [bool(monitor.take(found, HERE, None)) for _ in range(12)] == [k == 9 for k in range(12)]
 
 
 @given(share=st.floats(0.5, 1.5))
@@ -345,7 +359,7 @@ def test_the_stated_error_of_the_rig_explains_its_difference(share: float) -> No
     monitor, error = PoseMonitor(_RIG.anchors, 0.003, 0.01), 0.003 + share * 0.01 * 2.7955 / 1.96
     found = seen_at(FrameRequest(0, 0.0, 0.0, None), error, deviation=1e-6).found
     assert isinstance(found, PoseMeasurement)
-    assert any(monitor.take(found, HERE) for _ in range(10)) == (share > 1.0 + 1e-6)
+    assert any(monitor.take(found, HERE, HERE) for _ in range(10)) == (share > 1.0 + 1e-6)
 
 
 @given(axis=st.sampled_from(np.eye(3).tolist()), degrees=st.floats(0.5, 6.0))
@@ -360,10 +374,11 @@ def test_a_platform_rotated_about_its_origin_differs_where_an_anchor_is_too_far_
         covariance=1e-12 * np.eye(6),
     )
     off = np.linalg.norm(_RIG.anchors @ (rotated.rotation - np.eye(3)).T, axis=1).max()
-    texts = [monitor.take(found, HERE) for _ in range(10)]
-    assert bool(texts[-1]) == (off > 0.00301)
+    texts = [monitor.take(found, HERE, None) for _ in range(10)]
+    if off < 0.003:
+        assert not texts[-1]
     if off > 0.00301:
-        assert f"0.0 mm and {degrees:.1f} deg from its encoder pose" in texts[-1]
+        assert f"0.0 mm and {degrees:.1f} deg from its planned pose" in texts[-1]
 
 
 def test_poses_between_images_follow_a_curve() -> None:
@@ -382,9 +397,9 @@ def test_poses_between_images_follow_a_curve() -> None:
         for k in range(20 * 5):
             time = k / 10.0
             if k % 5 == 0:
-                run.trigger(time, time, None, on_circle(time))
+                run.trigger(time, time, None, on_circle(time), on_circle(time))
             elif between == 1:
-                run.drive(time, None, on_circle(time))
+                run.drive(time, None, on_circle(time), on_circle(time))
             reported[between] += run.news()
     assert not reported[1]
     assert [news.code for news in reported[5]] == ["pose_differs"]
@@ -399,7 +414,7 @@ def test_each_camera_off_the_encoder_pose_is_named_where_they_disagree(wrong: st
     ]
     run, reported = RunCameras(eyes, MODEL, 0.0, RATE), []
     for k in range(15):
-        run.trigger(k / RATE, k / RATE, None, HERE)
+        run.trigger(k / RATE, k / RATE, None, HERE, HERE)
         reported += [news.text for news in run.news() if news.code == "pose_differs"]
     named = [name for name in shifts if wrong in (name, "both")]
     assert [text.split(" measured")[0] for text in reported] == [f"camera {n}" for n in named]

@@ -122,7 +122,7 @@ def test_the_stop_can_be_left_out_and_the_run_still_does_not_pass(
     assert "clearance_tag" in failed
     (differs,) = (e["text"] for e in summary["events"] if e["code"] == "pose_differs")
     assert re.search(
-        r"the platform 5\.\d mm and 0\.\d deg from its encoder pose, in 10 images in a row", differs
+        r"the platform 5\.\d mm and 0\.\d deg from its planned pose, in 10 images in a row", differs
     )
     assert failed["camera_pose"].lower() == f"{differs}.".lower()
 

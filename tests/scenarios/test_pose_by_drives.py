@@ -25,7 +25,7 @@ def test_each_image_comes_with_the_drives_pose_of_its_own_time(
     requests: list[tuple[float, Pose | None]] = []
 
     def trigger(
-        time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None, is_due: bool
+        time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None, *_: object
     ) -> None:
         requests.append((time, encoder_pose))
 
