@@ -128,7 +128,7 @@ class MultiCameraMonitor:
             self.news.append(CameraNews("camera_sees_nothing", text))
 
 
-#: True poses that go with a request: a synthetic image shows the platform of its latency ago.
+#: Most true poses that wait for a busy camera: a synthetic image shows those of its latency ago.
 _TRUE_POSES = 50
 #: Largest wait for the last images at the end of a run, and after a stop; interval of checks, [s].
 PATIENCE, HURRY, ROUND = 20.0, 2.0, 0.05
@@ -234,6 +234,8 @@ class RunCameras:
         asked_clients = frozenset(client.name for client in self._clients if client.ask(trigger))
         if asked_clients:
             self._open.append(_FrameSet(trigger, asked_clients))
+        if len(asked_clients) == sum(client.failed is None for client in self._clients):
+            self._true_poses.clear()
         self._frame += 1
         self._report_trouble()
 

@@ -41,7 +41,7 @@ class FrameRequest:
         asked: The same time, monotonic, [s].
         true_pose: Of the simulated platform; None with a real camera.
         encoder_pose: Platform pose from the encoders; None if unknown.
-        true_poses: The latest true poses of the simulated platform, with their times, [s].
+        true_poses: True poses since all cameras last took a request, with their times, [s].
     """
 
     frame: int

@@ -116,7 +116,7 @@ def judge(
         *distances(clearance, scene.obstacle_clearance, course.cameras, began, rig.platform_error),
         *encoder_pose(cycles),
         *camera(poses, course.cameras, began),
-        *(Check("camera_pose", False, _sentence(t)) for t in context.texts_of("pose_differs")),
+        *(Check("camera_pose", False, as_sentence(t)) for t in context.texts_of("pose_differs")),
         *(Check("drive_warning", True, f"Warning: {warning}.") for warning in warnings),
         *unheld,
         *(Check("record", False, f"{trouble}.") for trouble in course.troubles),
@@ -374,7 +374,8 @@ def camera(
     return [Check("camera", True, text)]
 
 
-def _sentence(text: str) -> str:
+def as_sentence(text: str) -> str:
+    """A clause as a sentence."""
     return f"{text[:1].upper()}{text[1:]}."
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from executor.recording.tables import PoseTable
-from executor.recording.verdict import NOT_ENDED
+from executor.recording.verdict import NOT_ENDED, as_sentence
 from executor.report.run_data import RunData, markdown, missing_images
 from executor.safety.fault_messages import faults_among, page_of, page_text
 from model.files.plan_file import OptimalPlannerDocument, PlannerDocument, WaypointsDocument
@@ -334,7 +334,7 @@ _QUALITY = 80
 def frames(run: RunData) -> str:
     """Up to six images, evenly spread over the kept ones, and how many are missing."""
     missing = missing_images(run.folder, (run.poses, *run.alone.values()))
-    note = paragraph(f"{missing[0].upper()}{missing[1:]}.") if missing else ""
+    note = paragraph(as_sentence(missing)) if missing else ""
     names = run.poses.picture
     kept = [i for i, name in enumerate(names) if name and run.folder.has_image(name)]
     if not kept:
