@@ -5,6 +5,7 @@ The libraries of a protocol are loaded only when used.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,10 @@ from typing import Literal
 
 import can
 
+from drivers.can_bus import SentFrame, receive_frame, transmit
+from drivers.cia402.pdo import EMCY_BASE, HEARTBEAT_BASE, SDO_REPLY_BASE, SDO_REQUEST_BASE
 from drivers.cia402.profile import power_bits, profile_of
+from drivers.cia402.sdo_jobs import SdoRequest
 from drivers.cia402.state_machine import (
     FAULTED,
     HOLDS,
@@ -23,7 +27,14 @@ from drivers.cia402.state_machine import (
     without_power,
 )
 from drivers.drive_group import CycleStatus, DriveGroup, DriveSnapshot, Pump
-from drivers.odrive.messages import ERROR_FLAG, AxisState, read_layouts, state_in, state_text
+from drivers.odrive.messages import (
+    ERROR_FLAG,
+    AxisState,
+    can_id,
+    read_layouts,
+    state_in,
+    state_text,
+)
 from model.rig import Rig
 
 STOPS_ALONE_WITHIN = 1.0
@@ -171,6 +182,38 @@ def cycles_until_reported(rig: Rig) -> int:
     ODrives have no SYNC: they apply it on arrival, and report their position later in the cycle.
     """
     return 0 if rig.document.drives.type == "odrive" else 1
+
+
+def nodes_present(rig: Rig, bus: can.BusABC, within: float = 0.5) -> set[int]:
+    """Nodes of the rig's drives that are heard on a bus; changes nothing.
+
+    CiA 402 drives are asked for their device type (1000h); ODrives send heartbeats.
+
+    Args:
+        rig: The robot; its winches name the nodes.
+        bus: An open bus, owned by the caller.
+        within: Time in which all must answer, [s].
+
+    Raises:
+        Fault: The bus failed.
+    """
+    document = rig.document.drives
+    senders: dict[int, int] = {}
+    if document.type == "odrive":
+        heartbeat = read_layouts(document.dbc).heartbeat.command
+        senders = {can_id(node, heartbeat): node for node in rig.drive_names}
+    else:
+        for node in rig.drive_names:
+            for base in (SDO_REPLY_BASE, HEARTBEAT_BASE, EMCY_BASE):
+                senders[base + node] = node
+            transmit(bus, SentFrame(SDO_REQUEST_BASE + node, SdoRequest(0x1000, 0).frame()))
+    present = set[int]()
+    deadline = time.monotonic() + within
+    while not present >= {*rig.drive_names} and (left := deadline - time.monotonic()) > 0.0:
+        message = receive_frame(bus, left)
+        if message and not (message.is_error_frame or message.is_remote_frame):
+            present.add(senders.get(message.arbitration_id, 0))
+    return present - {0}
 
 
 def check_drive_files(rig: Rig) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import can
 import typer
 
 from cdpr.cli.arguments import flag, option
@@ -11,10 +12,11 @@ from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, CHANNEL, INTERFACE, RIG, Triple, level_pose, rig_on_bus
 from cdpr.cli.output import Terminal, out, show_line
 from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
+from drivers.factory import nodes_present
 from executor.kernels import ready_to_simulate
 from executor.realtime.scheduling import real_time
 from executor.supervision import LocalRequests
-from model.errors import BadInput
+from model.errors import BadInput, Refused
 from model.plan import load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
@@ -82,6 +84,7 @@ def sim(
     ready_to_simulate(listener)
     bus = open_bus(BusSettings.of(the_rig))
     try:
+        _require_unoccupied(the_rig, bus)
         rehearsal = make_rehearsal(the_rig, bus, pose, load, behaviour=behaviour, eds=eds)
         if power_lost is not None:
             slack = 0.005 if slack_mm is None else slack_mm / 1000.0
@@ -101,6 +104,18 @@ def sim(
     finally:
         bus.shutdown()
     out.print("simulation ended")
+
+
+def _require_unoccupied(rig: Rig, bus: can.BusABC) -> None:
+    present = sorted(nodes_present(rig, bus))
+    if present:
+        raise Refused(
+            f"drives with node ids {', '.join(map(str, present))} already answer",
+            where=str(BusSettings.of(rig)),
+            why="two devices with the same node id corrupt each other's answers",
+            next_step="end the other `cdpr sim`, disconnect the real drives, or pass another"
+            " --channel",
+        )
 
 
 def _behaviour(names: list[str]) -> DriveBehaviour:

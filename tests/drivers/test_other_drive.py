@@ -6,18 +6,21 @@ import itertools
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
+import can
 import pytest
 
 from drivers.can_bus import BusSettings
 from drivers.drive_group import DriveGroup, GroupCommand, GroupState
-from drivers.factory import make_drive_group
+from drivers.factory import make_drive_group, nodes_present
 from model.errors import Refused
-from model.rig import Rig
+from model.rig import Rig, load_rig
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from tests.drivers.drive_bench import SteppedClock, three_on_a_bus
 from tests.drivers.other_drive import ENABLED, STOPPING, OtherDrive
 
+ROOT = Path(__file__).resolve().parents[2]
 _CHANNELS = itertools.count()
 NODE, INDEX = 4, 3
 MOST = 100
@@ -55,6 +58,23 @@ def until(group: DriveGroup, clock: SteppedClock, state: GroupState) -> None:
         group.send_cycle(group.targets.tolist())
         group.receive(5.0)
     pytest.fail(f"still {group.state} after {MOST} cycles: {group.receive(0.0).faults}")
+
+
+@pytest.mark.parametrize(
+    ("file", "can_id"),
+    [
+        ("gachon_8_6", 0x583),
+        ("gachon_8_6", 0x703),
+        ("gachon_8_6", 0x083),
+        ("gachon_8_6_odrive", 0x061),
+    ],
+)
+def test_a_drive_is_present_by_whatever_it_sends(file: str, can_id: int) -> None:
+    rig = load_rig(ROOT / "configs" / f"{file}.yaml")
+    with three_on_a_bus(BusSettings("virtual", f"other-{next(_CHANNELS)}")) as (near, far, _):
+        far.send(can.Message(arbitration_id=can_id, data=bytes(8), is_extended_id=False))
+        far.send(can.Message(arbitration_id=can_id + 0x001E, is_extended_id=False))  # no drive's
+        assert nodes_present(rig, near, 0.05) == {3}
 
 
 @pytest.mark.parametrize("late", [0.0, 0.004])

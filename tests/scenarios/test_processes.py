@@ -65,6 +65,9 @@ def over_udp(rig: Path, plan: Path, run: Path, port: int) -> tuple[int, dict[str
         assert drives.stdout is not None
         greeting = drives.stdout.readline()
         assert "8 simulated drives of gachon_8_6" in greeting, drives.communicate()
+        second, _, refusal = finished("sim", rig, *bus)
+        assert second == 3, refusal
+        assert "already answer" in refusal
         code, out, err = finished(
             *(
                 "run",
