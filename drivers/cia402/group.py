@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Set
 
 import can
 import numpy as np
@@ -309,17 +309,17 @@ class Cia402Group(CyclicGroup):
         own = self._watch.changes_on_their_own(goal, enables=enables)
         if self._state is GroupState.ENABLED and self._profile.follows_bit is not False:
             own += self._watch.ignoring_targets()
-        found = [*self._new_messages(), *own]
+        found = [*self._new_messages({node for node, _ in own}), *own]
         known = {text for _, text in (*self._faults, *found)}
         found += self._watch.state_faults(known, powered=powered)
         if self._goal is not Goal.RESET_FAULT:
             self._latch(found)
 
-    def _new_messages(self) -> list[tuple[int, str]]:
-        """Messages since the last call that are faults regardless of the replies."""
+    def _new_messages(self, shown: Set[int] = frozenset()) -> list[tuple[int, str]]:
+        """Messages since the last call that are faults whatever the replies have ``shown``."""
         found = self._watch.news()
         if self._state is GroupState.ENABLED:
-            found += stopped_between_replies(self._rig.drive_names, self._poll.new_words())
+            found += stopped_between_replies(self._rig.drive_names, self._poll.new_words(), shown)
         if self._goal in (Goal.ENABLE, Goal.RELEASE):
             return found
         # An emergency of a drive at rest only explains its state.

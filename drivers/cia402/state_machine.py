@@ -6,7 +6,7 @@ all drives are enabled together or none, for a release all that are under torque
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from enum import Enum, IntEnum, auto
 from itertools import compress
 from types import MappingProxyType
@@ -171,14 +171,15 @@ def ignoring_drives(
 
 
 def stopped_between_replies(
-    names: Mapping[int, str], status_words: Mapping[int, int]
+    names: Mapping[int, str], status_words: Mapping[int, int], shown: Set[int]
 ) -> list[tuple[int, str]]:
     """Enabled drives that were not so between two replies, by node; faults have their own message.
 
     Args:
         status_words: Read between replies, by node; not of all.
+        shown: Nodes whose replies tell that already.
     """
-    states = ((node, state_of(word)) for node, word in status_words.items())
+    states = ((node, state_of(word)) for node, word in status_words.items() if node not in shown)
     return [
         (node, f"{names[node]} stopped on its own: {state.value} between two replies")
         for node, state in states

@@ -32,6 +32,9 @@ from simulation.drives.cia402_rig import SimulatedCia402Rig
 
 _CHANNELS = itertools.count()
 
+CRUISING = 90
+"""A cycle of the short plan's run at its full speed, which it has from cycle 30 to 300."""
+
 
 @dataclass
 class Stage:

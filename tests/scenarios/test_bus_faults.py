@@ -11,9 +11,7 @@ import pytest
 from drivers.cia402.state_machine import DriveState
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
-from tests.scenarios.stage import Stage, at, staged
-
-CRUISING = 150
+from tests.scenarios.stage import CRUISING, Stage, at, staged
 
 
 def comes(can_id: int, data: bytes = b"", *, error: bool = False) -> Callable[[Stage], None]:

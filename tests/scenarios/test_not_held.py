@@ -23,11 +23,10 @@ from model.errors import Fault, Refused
 from model.rig import rig_from_document
 from simulation.drives.cia402 import SimulatedDrive
 from tests.cli.program import call
-from tests.scenarios.stage import Stage, at, concluded, staged
+from tests.scenarios.stage import CRUISING, Stage, at, concluded, staged
 from tests.scenarios.test_bus_faults import LOST_BY_CONTROLLER, PASSIVE, PROTOCOL_ERROR
 from tests.scenarios.test_real_time import drives_on
 
-CRUISING = 150
 FIFTH, SIXTH = 4, 5
 
 

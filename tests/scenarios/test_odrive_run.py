@@ -29,10 +29,9 @@ from planner.check import verify
 from simulation.drives.odrive import SimulatedOdriveRig
 from tests.cli.plans import CONFIGS, GOAL_MM, START_MM, free_scene, straight_plan
 from tests.cli.program import call, nothing_written
-from tests.scenarios.stage import Stage, at, concluded
+from tests.scenarios.stage import CRUISING, Stage, at, concluded
 
 ODRIVE = CONFIGS / "gachon_8_6_odrive.yaml"
-CRUISING = 150
 HELD_CYCLES = 10
 """Under torque before the brakes close."""
 

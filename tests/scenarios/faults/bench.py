@@ -38,11 +38,10 @@ from simulation.drives.eds_file import profile_path
 from tests.scenarios.faults.fault_bus import FaultBus, lose
 from tests.scenarios.faults.masters import StartsMasters, gone
 from tests.scenarios.faults.samples import Limits, Stopped, WatchedRehearsal, stopped, violations
-from tests.scenarios.stage import Stage
+from tests.scenarios.stage import CRUISING, Stage
 
 _CHANNELS = itertools.count()
 FINE = 0.001
-CRUISING = 150
 ARMED_AFTER = 15
 """SYNCs before the first set-point that moves."""
 EVERY_ID = range(0x800)

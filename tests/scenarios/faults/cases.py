@@ -355,7 +355,7 @@ TABLE: dict[str, Fault] = {
         outgoing(lambda: spoil(REPLY_4, shifted(99999), 2)), words=("drive 4", "jumped")
     ),
     "F12 sign flipped": Fault(
-        outgoing(lambda: spoil(REPLY_4, mirrored)), words=("drive 4", "jumped")
+        outgoing(lambda: spoil(REPLY_4, mirrored)), words=("cable 4", "from its set-point")
     ),
     "F12 a frozen position": Fault(
         outgoing(lambda: spoil(REPLY_4, frozen())), words=("(drive 4) did not move",)

@@ -59,7 +59,7 @@ def test_row_and_travel_are_those_last_sent(
     table, rows = prepared.checked.table, cycles.path_index
     stopped = np.array(cycles.state) == State.LATCHED.value
     assert stopped.sum() > 5
-    assert 100 < rows[-1] < len(table) - 1
+    assert 60 < rows[-1] < len(table) - 1
     assert (cycles.set_counts[stopped] == table.setpoints[rows[stopped]]).all()
     assert np.abs(cycles.actual_counts - cycles.set_counts)[stopped].max() <= FOLLOWED
     assert summary["travelled_mm"] == pytest.approx(table.travelled[rows[-1]] * 1e3, abs=1e-6)
