@@ -19,8 +19,8 @@ from model.pose import (
     floats_of,
     matrix_from_rotation_vector,
     moved,
+    points_by_twist,
     read_only,
-    skew,
 )
 from model.statics.wrench_sets import rms_anchor_radius
 
@@ -351,8 +351,7 @@ def _squares_near(
     cables = cables_to(rig, anchors_at(rig, positions, rotations))
     matrices, errors = structure_matrix_of(cables, positions), cables.lengths - lengths
     arms, shares = cables.anchors - positions[:, None, :], errors / cables.lengths
-    by_twist = np.zeros((*arms.shape, 6))
-    by_twist[..., :3], by_twist[..., 3:] = np.eye(3), -skew(arms)
+    by_twist = points_by_twist(arms)
     normal = (matrices * (1.0 - shares[:, None, :])) @ np.swapaxes(matrices, 1, 2)
     normal += np.einsum("nm,nmki,nmkj->nij", shares, by_twist, by_twist)
     mixed = np.einsum("nm,nmi,nmj->nij", errors, cables.directions, arms)

@@ -110,6 +110,17 @@ def skew(vector: ArrayLike) -> Array:
     return (vectors @ _CROSS).reshape(*vectors.shape, 3)
 
 
+def points_by_twist(arms: ArrayLike) -> Array:
+    """Velocities of points of a body per unit of its twist, shape (..., 3, 6) of (..., 3).
+
+    Args:
+        arms: From the body's origin to the points, axes of the twist, [m].
+    """
+    turning = -skew(arms)
+    moving = np.broadcast_to(np.eye(3), turning.shape)
+    return np.concatenate([moving, turning], axis=-1)
+
+
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:
     """Rotation matrix of a unit quaternion (w, x, y, z); shape (3, 3)."""
     w, x, y, z = np.asarray(quaternion, dtype=np.float64).tolist()

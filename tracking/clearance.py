@@ -12,7 +12,7 @@ from model.cameras import Z_95
 from model.clearance import ClearanceModel, Nearest, cable_name
 from model.errors import BadInput
 from model.kinematics import Cables, cables_at
-from model.pose import Array, Pose, read_only, skew
+from model.pose import Array, Pose, points_by_twist, read_only
 from model.rig import Camera, Rig
 from tracking.measurement import PoseMeasurement, largest_deviations
 
@@ -160,7 +160,7 @@ def _variance(
         at_outlet = 1.0 - share**2 if is_shared else (1.0 - share) ** 2
         own = at_outlet * ends[0] ** 2 + (share * ends[1]) ** 2
     arm = point - pose.position
-    by_pose = share * np.hstack([np.eye(3), -skew(arm)])
+    by_pose = share * points_by_twist(arm)
     covariance = by_pose @ spread @ by_pose.T
     line = nearest.first_point - nearest.second_point
     length = float(np.linalg.norm(line))

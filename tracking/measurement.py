@@ -17,9 +17,9 @@ from model.pose import (
     Pose,
     interpolate,
     matrix_from_rotation_vector,
+    points_by_twist,
     read_only,
     rotation_vector_from_matrix,
-    skew,
 )
 
 if TYPE_CHECKING:
@@ -403,7 +403,7 @@ class PoseMonitor:
             return ""
         arms = self._points @ measured.pose.rotation.T
         points = measured.pose.position + arms
-        by_pose = np.concatenate([np.broadcast_to(np.eye(3), (len(arms), 3, 3)), -skew(arms)], 2)
+        by_pose = points_by_twist(arms)
         covariance = by_pose @ (measured.covariance + measured.shared) @ by_pose.swapaxes(1, 2)
         largest = np.linalg.norm(covariance + self._platform, 2, axis=(1, 2))
         explained = self._tolerance + _CHI_95 * np.sqrt(largest)

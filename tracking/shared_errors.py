@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from model.cameras import Z_95, exchanged_sources
 from model.errors import Fault
-from model.pose import Array, Pose, read_only, skew
+from model.pose import Array, Pose, points_by_twist, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import (
     lever_arm_matrix,
@@ -207,7 +207,7 @@ def tag_error_slopes(tag: Tag, error: float) -> Array:
     reach = float(rms(arms))
     shift = error / Z_95 / np.sqrt(6.0)
     turn = error / Z_95 / (2.0 * reach)
-    return np.array([np.hstack([shift * np.eye(3), -turn * skew(arm)]) for arm in arms])
+    return np.asarray(points_by_twist(arms) * np.repeat([shift, turn], 3))
 
 
 def implied_rotation(camera: Camera) -> Array:

@@ -27,7 +27,7 @@ from model.cameras import Z_95
 from model.files.camera_file import PoseCovariance, PoseSlopes
 from model.files.documents import AnyNonNegative, PoseDocument, Vector
 from model.files.rig_file import RigDocument
-from model.pose import Array, Pose, skew, step_between
+from model.pose import Array, Pose, points_by_twist, step_between
 from model.rig import Camera, Rig
 from tracking.camera_model import rms
 
@@ -96,7 +96,7 @@ class ExtrinsicCalibration:
     def _error_by(self, covariance: Array) -> float:
         """The error that a covariance of the pose causes, [m]."""
         arms = self.points - self.world_from_camera.position
-        slopes = np.concatenate([np.hstack([np.eye(3), -skew(arm)]) for arm in arms])
+        slopes = np.concatenate(points_by_twist(arms))
         return float(np.sqrt(3.0)) * rms_bound(covariance, slopes)  # of all axes
 
 

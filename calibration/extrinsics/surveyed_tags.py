@@ -18,7 +18,7 @@ from calibration.statistics import chi_squared_bound, widened
 from calibration.tag_map.observations import TagObservations
 from model.cameras import Z_95
 from model.errors import BadInput
-from model.pose import Array, Pose, moved, read_only, skew, step_between
+from model.pose import Array, Pose, moved, points_by_twist, read_only, step_between
 from model.rig import Camera, Rig, Tag
 from tracking.camera_model import (
     point_slopes,
@@ -54,8 +54,7 @@ class Survey:
         if self.turn is None:
             return self.shift * np.eye(12)
         arms = tag_corners(tag) - tag.pose.position
-        turns = self.turn * np.concatenate([-skew(arm) for arm in arms])
-        return np.concatenate([self.shift * np.tile(np.eye(3), (4, 1)), turns], axis=1)
+        return np.concatenate(points_by_twist(arms) * np.repeat([self.shift, self.turn], 3))
 
     def of_pixels(self, camera: Camera, camera_from_world: Pose, tag: Tag) -> Array:
         """Covariance of a tag's undistorted pixels from survey errors, shape (8, 8), [px²]."""

@@ -23,7 +23,7 @@ from calibration.tag_map.observations import (
     moved_tags,
 )
 from model.errors import BadInput
-from model.pose import Array, Pose, moved, read_only, skew
+from model.pose import Array, Pose, moved, points_by_twist, read_only, skew
 from model.rig import Camera, Rig, Tag
 from tracking.detection.tags import tag_corners
 from tracking.pnp import TagView, solve_pnp
@@ -121,8 +121,8 @@ def corner_slopes(tags: Sequence[Tag]) -> Array:
     """Derivatives of corners by tag poses, shape (4 t, 3, 6 t)."""
     slopes = np.zeros((4 * len(tags), 3, 6 * len(tags)))
     for k, tag in enumerate(tags):
-        for corner, arm in enumerate(tag_corners(tag) - tag.pose.position):
-            slopes[4 * k + corner, :, 6 * k : 6 * k + 6] = np.hstack([np.eye(3), -skew(arm)])
+        arms = tag_corners(tag) - tag.pose.position
+        slopes[4 * k : 4 * k + 4, :, 6 * k : 6 * k + 6] = points_by_twist(arms)
     return slopes
 
 

@@ -18,6 +18,7 @@ from model.pose import (
     interpolate,
     matrix_from_quaternion,
     matrix_from_rotation_vector,
+    points_by_twist,
     quaternion_from_matrix,
     rotation_vector_from_matrix,
     skew,
@@ -169,6 +170,12 @@ def test_a_vector_beyond_half_a_turn_gives_the_same_rotation(axis: Vector, angle
 @given(points, points)
 def test_skew_is_the_cross_product(a: Vector, b: Vector) -> None:
     np.testing.assert_allclose(skew(a) @ b, np.cross(a, b), atol=1e-12)
+
+
+@given(points, points, points)
+def test_points_of_a_body_move_as_its_twist_says(arm: Vector, v: Vector, w: Vector) -> None:
+    moved = points_by_twist([arm, v]) @ np.concatenate([v, w])
+    np.testing.assert_allclose(moved, np.add(v, np.cross([w, w], [arm, v])), atol=1e-12)
 
 
 @given(poses, poses, poses, points)
