@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from model.pose import Pose
+
 
 class State(Enum):
     """State of a run."""
@@ -163,6 +165,25 @@ class CycleRecord:
     lateness: float
     tension_known: tuple[bool, ...]
     press: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlatformPoses:
+    """Poses of the platform at one moment of a run; None where they are unknown.
+
+    Attributes:
+        time: Since the start of the run, [s].
+        at: The same time, monotonic, [s].
+        true: Of the simulated platform.
+        encoder: From the encoders.
+        planned: On the path.
+    """
+
+    time: float
+    at: float
+    true: Pose | None = None
+    encoder: Pose | None = None
+    planned: Pose | None = None
 
 
 @dataclass(frozen=True, slots=True)

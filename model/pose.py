@@ -111,14 +111,9 @@ def skew(vector: ArrayLike) -> Array:
 
 
 def points_by_twist(arms: ArrayLike) -> Array:
-    """Velocities of points of a body per unit of its twist, shape (..., 3, 6) of (..., 3).
-
-    Args:
-        arms: From the body's origin to the points, axes of the twist, [m].
-    """
+    """Velocities of points of a body by its twist, shape (..., 3, 6) of (..., 3); its axes, [m]."""
     turning = -skew(arms)
-    moving = np.broadcast_to(np.eye(3), turning.shape)
-    return np.concatenate([moving, turning], axis=-1)
+    return np.concatenate([np.broadcast_to(np.eye(3), turning.shape), turning], axis=-1)
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Array:

@@ -112,7 +112,7 @@ def _require_unoccupied(rig: Rig, bus: can.BusABC) -> None:
         raise Refused(
             f"drives with node ids {', '.join(map(str, present))} already answer",
             where=str(BusSettings.of(rig)),
-            why="two devices with the same node id corrupt each other's answers",
+            why="two drives with the same node id answer each request twice",
             next_step="end the other `cdpr sim`, disconnect the real drives, or pass another"
             " --channel",
         )

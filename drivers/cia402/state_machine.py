@@ -177,7 +177,7 @@ def stopped_between_replies(
 
     Args:
         status_words: Read between replies, by node; not of all.
-        shown: Nodes whose replies tell that already.
+        shown: Nodes whose replies show that already.
     """
     states = ((node, state_of(word)) for node, word in status_words.items() if node not in shown)
     return [

@@ -11,6 +11,7 @@ import numpy as np
 
 from executor.cameras.process import CameraProcess, CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
+from executor.state_machine import PlatformPoses
 from model.errors import CdprError, Fault, Refused, without_passwords
 from model.kinematics import cable_lengths, structure_matrix
 from model.pose import Pose, moved, step_between
@@ -107,7 +108,7 @@ class CameraClient:
         self._try(lambda: self._process.ask(trigger))
         if self.failed is not None:
             return False
-        self._health.ask(trigger.asked)
+        self._health.ask(trigger.poses.at)
         return True
 
     def collect(self) -> CameraSample | None:
@@ -129,8 +130,8 @@ class CameraClient:
         if unanswered is None:
             return None
         if self.failed is None:
-            self.failed = CdprError(f"no answer since {unanswered.time:.2f} s")
-        sample = sample_without_pose(unanswered.frame, unanswered.time, self.failed.what)
+            self.failed = CdprError(f"no answer since {unanswered.poses.time:.2f} s")
+        sample = sample_without_pose(unanswered.frame, unanswered.poses.time, self.failed.what)
         self.samples.append(sample)
         return sample
 
@@ -375,7 +376,7 @@ def samples_at_rest(
         check_stop()
         asked = time.monotonic()
         since = asked - began if period is None else frame * period
-        process.ask(FrameRequest(frame, since, asked, true_pose))
+        process.ask(FrameRequest(frame, PlatformPoses(since, asked, true_pose)))
         samples.append(_answer(process, asked + PATIENCE, check_stop))
     return samples
 

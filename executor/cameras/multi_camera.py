@@ -11,6 +11,7 @@ from executor.cameras.client import BLIND_IMAGES, CameraClient, CameraNews
 from executor.cameras.process import CameraSample, FrameRequest, sample_without_pose
 from executor.recording.record_files import CameraRecord
 from executor.remote.status import RunStatus
+from executor.state_machine import PlatformPoses
 from executor.supervision import RequestBoard, StopReason
 from model.cameras import exchanged_sources
 from model.clearance import ClearanceModel
@@ -207,30 +208,15 @@ class RunCameras:
             return ""
         return "all cameras failed: " + "; ".join(f"{name}: {why}" for name, why in failed.items())
 
-    def trigger(
-        self,
-        time: float,
-        asked: float,
-        true_pose: Pose | None,
-        encoder_pose: Pose | None,
-        planned: Pose | None = None,
-    ) -> None:
-        """Collects samples, and requests an image of the present time.
-
-        Args:
-            time: Since the start of the run, [s].
-            asked: The same time on the monotonic clock, [s].
-            true_pose: Of the simulated platform; None with real cameras.
-            encoder_pose: Platform pose from the encoders; None if unknown.
-            planned: Platform pose of the plan; None beside its path.
-        """
-        self._now = asked
-        self.drive(time, true_pose, encoder_pose, planned)
+    def trigger(self, poses: PlatformPoses) -> None:
+        """Collects samples, and requests an image of the present time."""
+        self._now = poses.at
+        self.drive(poses)
         for client in self._clients:
             self._put(client, client.collect())
         self._process_complete()
         known = tuple(self._true_poses)
-        trigger = FrameRequest(self._frame, time, asked, true_pose, encoder_pose, known)
+        trigger = FrameRequest(self._frame, poses, known)
         asked_clients = frozenset(client.name for client in self._clients if client.ask(trigger))
         if asked_clients:
             self._open.append(_FrameSet(trigger, asked_clients))
@@ -239,13 +225,11 @@ class RunCameras:
         self._frame += 1
         self._report_trouble()
 
-    def drive(
-        self, time: float, true: Pose | None, encoder: Pose | None, planned: Pose | None
-    ) -> None:
-        """Takes poses between which images are taken; arguments as for `trigger`."""
-        self._common.history.add(time, planned, encoder)
-        if true is not None:
-            self._true_poses.append((time, true))
+    def drive(self, poses: PlatformPoses) -> None:
+        """Takes poses between which images are taken."""
+        self._common.history.add(poses.time, poses.planned, poses.encoder)
+        if poses.true is not None:
+            self._true_poses.append((poses.time, poses.true))
 
     def news(self) -> list[CameraNews]:
         """New conditions since the last call."""
@@ -328,7 +312,7 @@ class RunCameras:
         if samples:
             return self._common.of(samples)
         reason = next((e.failed.what for e in self._clients if e.failed), "no camera answered")
-        return sample_without_pose(frame_set.trigger.frame, frame_set.trigger.time, reason)
+        return sample_without_pose(frame_set.trigger.frame, frame_set.trigger.poses.time, reason)
 
     def _report_trouble(self) -> None:
         troubles = {client.name: client.trouble(self._now) for client in self._clients}
@@ -382,21 +366,13 @@ class CameraWatch:
         self._cameras, self._status, self._board = cameras, status, board
         self._report, self._clearance_stop, self._listener = report, clearance_stop, listener
 
-    def trigger(
-        self,
-        time: float,
-        asked: float,
-        true_pose: Pose | None,
-        encoder_pose: Pose | None,
-        planned: Pose | None = None,
-        is_due: bool = True,
-    ) -> None:
-        """Requests an image if one is due; other arguments as for `RunCameras.trigger`."""
+    def trigger(self, poses: PlatformPoses, is_due: bool = True) -> None:
+        """Takes poses, and requests an image if one is due."""
         if not is_due:
-            self._cameras.drive(time, true_pose, encoder_pose, planned)
+            self._cameras.drive(poses)
             return
-        self._cameras.trigger(time, asked, true_pose, encoder_pose, planned)
-        self._report_news(asked)
+        self._cameras.trigger(poses)
+        self._report_news(poses.at)
         each = self._cameras.as_dict()
         self._status.take_cameras(each)
         if self._cameras.newest is not None:

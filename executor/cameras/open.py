@@ -173,13 +173,14 @@ class RenderedImages:
 
     def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """Renders the platform at its true pose, of the true latency ago."""
-        if trigger.true_pose is None:
+        now = trigger.poses
+        if now.true is None:
             raise Fault("the synthetic camera has no platform pose")
         known = self._poses[-1][0] if self._poses else -math.inf
         self._poses += [pose for pose in trigger.true_poses if pose[0] > known]
-        if not self._poses or self._poses[-1][0] < trigger.time:
-            self._poses.append((trigger.time, trigger.true_pose))
-        exposed = trigger.time - self._true_latency
+        if not self._poses or self._poses[-1][0] < now.time:
+            self._poses.append((now.time, now.true))
+        exposed = now.time - self._true_latency
         image = self._film.image(exposed, self._pose_at(exposed), trigger.frame)
         return image, -self._latency
 
@@ -211,7 +212,7 @@ class LiveImages:
     def image(self, trigger: FrameRequest) -> tuple[NDArray[np.uint8], float]:
         """The next image, and the middle of its exposure after the request, [s]."""
         frame = self._camera.read()
-        return frame.image, frame.time - trigger.asked
+        return frame.image, frame.time - trigger.poses.at
 
     @property
     def unused(self) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from executor.cameras.live_image import ImageBoard
 from executor.realtime.scheduling import ended_at_start, interrupts_blocked
 from executor.recording.run_folder import RunFolder
+from executor.state_machine import PlatformPoses
 from model.errors import CdprError, Fault, require_child_processes
 from model.pose import Pose
 from model.rig import Camera, Rig
@@ -37,18 +38,12 @@ class FrameRequest:
 
     Attributes:
         frame: Frame number, the same for all cameras.
-        time: Since the start of the run, [s].
-        asked: The same time, monotonic, [s].
-        true_pose: Of the simulated platform; None with a real camera.
-        encoder_pose: Platform pose from the encoders; None if unknown.
+        poses: Of the platform, when it is requested.
         true_poses: True poses since all cameras last took a request, with their times, [s].
     """
 
     frame: int
-    time: float
-    asked: float
-    true_pose: Pose | None
-    encoder_pose: Pose | None = None
+    poses: PlatformPoses
     true_poses: tuple[tuple[float, Pose], ...] = ()
 
 
@@ -156,8 +151,9 @@ class CameraWorker:
             self._kept += 1
             if self._kept % KEPT_IMAGES == 0:
                 self._keep_every *= 2
-        taken = trigger.time + delay
-        encoder_pose = self._drives.at(taken, trigger.time, trigger.encoder_pose)
+        now = trigger.poses
+        taken = now.time + delay
+        encoder_pose = self._drives.at(taken, now.time, now.encoder)
         began = time.monotonic()
         found = self._tracker.observe(image, taken, encoder_pose)
         self._newest = trigger.frame, image, found

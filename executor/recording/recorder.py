@@ -17,7 +17,7 @@ from executor.recording.run_folder import RunEvent, RunFolder
 from executor.recording.table_files import Integers
 from executor.recording.tables import CycleTable, quaternions_of
 from executor.remote.status import RunStatus
-from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, State
+from executor.state_machine import ON_PATH, CycleRecord, LoopEvent, PlatformPoses, State
 from executor.trajectory.dwell import legs_at, stop_events
 from executor.trajectory.setpoints import CheckedTrajectory, PreparedRun
 from model.errors import CdprError, Fault
@@ -347,9 +347,8 @@ class RecordWriter:
                 self._trouble = self._trouble or Fault(what, where=str(self._folder.path))
 
 
-#: Takes poses: time since the start of the run [s], the same time on the monotonic clock [s], true
-#: pose of the simulated platform, encoder pose, planned pose on the path, and if an image is due.
-FrameTrigger = Callable[[float, float, Pose | None, Pose | None, Pose | None, bool], None]
+#: Takes poses of the platform, and whether an image is due.
+FrameTrigger = Callable[[PlatformPoses, bool], None]
 #: Longest time between these, also where images are rarer: platforms move along curves, [s].
 _BETWEEN_POSES = 0.1
 
@@ -426,9 +425,10 @@ class Recorder:
         if record.cycle % self._every == 0:
             self._progress(record.index)
         if self._trigger is not None and record.cycle % self.pose_every == 0:
-            poses = true_pose, self.log.encoder_pose(record), self.log.planned_pose(record)
+            since, log = record.at - self._began, self.log
+            known = true_pose, log.encoder_pose(record), log.planned_pose(record)
             is_due = record.cycle % self._every == 0
-            self._trigger(record.at - self._began, record.at, *poses, is_due)
+            self._trigger(PlatformPoses(since, record.at, *known), is_due)
         self.writer.take_cycles(record.at)
         if failure is not None:
             raise failure

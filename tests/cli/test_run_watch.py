@@ -13,6 +13,7 @@ import pytest
 from executor.cameras.client import CameraClient
 from executor.cameras.multi_camera import CameraRecords, CameraWatch, RunCameras
 from executor.cameras.process import CameraSample
+from executor.state_machine import PlatformPoses
 from executor.supervision import Callbacks, GuardedListener, LocalRequests, StopReason
 from model.progress import Listener
 from tests.executor.test_run_cameras import MODEL, RATE, Scripted
@@ -34,7 +35,7 @@ def watched(
         clearance_stop=clearance_stop,
     )
     for k in range(moments):
-        watch.trigger(k / RATE, k / RATE, None, None)
+        watch.trigger(PlatformPoses(k / RATE, k / RATE))
     return board, reported
 
 
@@ -99,7 +100,7 @@ def test_skipped_images_are_reported_with_those_that_were_not_used(
         clearance_stop=False,
     )
     for k in range(6):
-        watch.trigger(k / RATE, k / RATE, None, None)
+        watch.trigger(PlatformPoses(k / RATE, k / RATE))
     watch.finish(1.0)
     assert reported == [
         (

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from drivers.cameras.live import Frame
 from executor.cameras.open import LiveImages, RenderedImages
 from executor.cameras.process import KEPT_IMAGES, CameraWorker, FrameRequest, _serve
+from executor.state_machine import PlatformPoses
 from model.pose import Pose
 from model.rig import load_rig
 from tests.cli.plans import RIG
@@ -65,7 +66,9 @@ def test_a_run_on_hold_for_hours_keeps_few_images_over_all_of_it(frames: int, pl
     every = max(1, planned // KEPT_IMAGES)
     worker = CameraWorker(_RIG, _RIG.cameras[0], Dark(), folder, every, named=False)
     worker._tracker = tracker
-    names = [worker.measure(FrameRequest(n, 0.1 * n, 0.0, None)).picture for n in range(frames)]
+    names = [
+        worker.measure(FrameRequest(n, PlatformPoses(0.1 * n, 0.0))).picture for n in range(frames)
+    ]
     assert [n for n, name in enumerate(names) if name] == kept
     assert kept[0] == 0
     doublings = max(0.0, np.log2(frames / (every * KEPT_IMAGES)))
@@ -91,7 +94,7 @@ def test_a_synthetic_image_shows_the_platform_of_its_latency_ago() -> None:
     source = RenderedImages(film, latency=0.05, true_latency=0.12)
     for k in range(5):
         pose = Pose.level([0.1 * k, 0.0, 0.0])
-        _, delay = source.image(FrameRequest(k, 0.1 * k, 0.0, pose, None))
+        _, delay = source.image(FrameRequest(k, PlatformPoses(0.1 * k, 0.0, pose)))
         assert delay == -0.05
     expected = [(0.1 * k - 0.12, max(0.0, 0.1 * k - 0.12)) for k in range(5)]
     np.testing.assert_allclose(film.shown, expected, atol=1e-12)
@@ -104,7 +107,7 @@ def test_a_synthetic_image_of_a_rare_camera_shows_the_curve_between_two_requests
     poses = [(0.1 * k, Pose.level([np.cos(0.1 * k), 0.0, 0.0])) for k in range(51)]
     for k in range(6):
         recent = tuple(poses[max(0, 10 * k - 20) : 10 * k + 1])
-        source.image(FrameRequest(k, 1.0 * k, 0.0, recent[-1][1], None, recent))
+        source.image(FrameRequest(k, PlatformPoses(1.0 * k, 0.0, recent[-1][1]), recent))
     np.testing.assert_allclose(
         film.shown[1:], [(k - 0.25, np.cos(k - 0.25)) for k in range(1, 6)], atol=2e-3
     )
@@ -115,7 +118,7 @@ def test_a_live_image_may_be_exposed_before_it_is_requested() -> None:
         read=lambda: Frame(12.26, np.zeros((4, 4), np.uint8), "x"), late=3, truncated=1
     )
     source = LiveImages(camera)
-    _, delay = source.image(FrameRequest(0, 1.0, 12.3, None, None))
+    _, delay = source.image(FrameRequest(0, PlatformPoses(1.0, 12.3)))
     assert delay == pytest.approx(-0.04)
     assert source.unused == (3, 1)
 
@@ -124,5 +127,5 @@ def test_a_sample_states_how_many_images_were_not_used() -> None:
     tracker: Any = SimpleNamespace(observe=lambda *_: NoPose(0.0, "dark"))
     worker = CameraWorker(_RIG, _RIG.cameras[0], Dark(), None, 1, named=False)
     worker._tracker = tracker
-    sample = worker.measure(FrameRequest(0, 0.0, 0.0, None))
+    sample = worker.measure(FrameRequest(0, PlatformPoses(0.0, 0.0)))
     assert (sample.late, sample.truncated) == Dark.unused

@@ -339,7 +339,7 @@ def test_poses_come_at_least_ten_times_a_second_and_with_every_image(
 ) -> None:
     """Of 10 ms; a camera may take an image only once a second."""
     due: list[bool] = []
-    recorder = recorder_of(folder, [], monkeypatch, every, lambda *given: due.append(given[5]))
+    recorder = recorder_of(folder, [], monkeypatch, every, lambda *given: due.append(given[1]))
     record = cycle_at(0.0, State.READY)
     assert recorder.pose_every == pose_every
     for k in range(2 * every + 1):

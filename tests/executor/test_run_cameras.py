@@ -36,6 +36,7 @@ from executor.cameras.process import (
 from executor.cameras.sources import cycles_per_image
 from executor.proposals import homing_proposal
 from executor.remote.client import camera_line
+from executor.state_machine import PlatformPoses
 from model.clearance import ClearanceModel
 from model.errors import BadInput, Fault
 from model.pose import Pose, matrix_from_rotation_vector
@@ -83,7 +84,7 @@ def seen_at(
     covariance = np.diag([deviation**2] * 3 + [1e-6] * 3)
     pose = Pose(HERE.position + np.array([shift, 0.0, 0.0]), HERE.rotation)
     found = PoseMeasurement(
-        trigger.time + late, pose, covariance, (301, 303), 0.1, "tracked", unstated=False
+        trigger.poses.time + late, pose, covariance, (301, 303), 0.1, "tracked", unstated=False
     )
     return CameraSample(trigger.frame, found, seconds=0.005)
 
@@ -119,7 +120,7 @@ class Scripted:
             return None
         trigger, self.unanswered = self.unanswered, None
         if self._blind:
-            return sample_without_pose(trigger.frame, trigger.time, "no tag")
+            return sample_without_pose(trigger.frame, trigger.poses.time, "no tag")
         return seen_at(trigger, **self._off)
 
 
@@ -162,7 +163,7 @@ def run_of(moments: int, *cameras: Any) -> tuple[RunCameras, list[str]]:
     eyes = [CameraClient(camera, "here") for camera in cameras]
     run, reported = RunCameras(eyes, MODEL, _SCENE.obstacle_clearance, RATE), []
     for k in range(moments):
-        run.trigger(k / RATE, 100.0 + k / RATE, None, None)
+        run.trigger(PlatformPoses(k / RATE, 100.0 + k / RATE))
         reported += [news.text for news in run.news()]
     return run, reported
 
@@ -214,7 +215,7 @@ def test_a_slow_camera_does_not_keep_what_the_other_sees(late: int) -> None:
     limit = 10.0  # every clearance is too small
     run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(5):
-        run.trigger(k / RATE, k / RATE, None, None)
+        run.trigger(PlatformPoses(k / RATE, k / RATE))
     assert "the scene requires 10000 mm" in run.near
 
 
@@ -234,7 +235,7 @@ def test_too_small_a_clearance_is_noticed_whatever_a_camera(
     cameras: list[Any] = [Scripted("front", front), Scripted("side", side)]
     run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(10):
-        run.trigger(k / RATE, k / RATE, None, None)
+        run.trigger(PlatformPoses(k / RATE, k / RATE))
     assert "the scene requires 10000 mm" in run.near
     frames = [look.frame for look in run.finish(never).together]
     assert frames == sorted(set(frames))
@@ -274,7 +275,7 @@ def test_cameras_that_disagree_are_reported_once_and_clearance_is_not_measured()
 
 
 def nearest_at(shift: float) -> MeasuredClearance:
-    found = seen_at(FrameRequest(0, 0.0, 0.0, None), shift).found
+    found = seen_at(FrameRequest(0, PlatformPoses(0.0, 0.0)), shift).found
     assert isinstance(found, PoseMeasurement)
     clearance = clearance_of(MODEL, found)
     assert clearance is not None
@@ -292,7 +293,7 @@ def test_of_cameras_that_disagree_one_that_sees_too_little_clearance_is_enough(w
     eyes = [CameraClient(Scripted(n, [0], shift), "here") for n, shift in shifts.items()]  # type: ignore[arg-type]
     run, reported = RunCameras(eyes, MODEL, limit, RATE), []
     for k in range(4):
-        run.trigger(k / RATE, k / RATE, None, None)
+        run.trigger(PlatformPoses(k / RATE, k / RATE))
         reported.append(run.near)
     assert not any(reported[:2])
     assert f"measured by camera {sees} alone" in run.near
@@ -308,7 +309,7 @@ def test_a_platform_off_its_encoder_pose_is_reported_once(
     eyes = [CameraClient(Scripted(name, [0], shift_mm / 1e3), "here") for name in names]  # type: ignore[arg-type]
     run, reported = RunCameras(eyes, MODEL, 0.0, RATE), []
     for k in range(images + 1):
-        run.trigger(k / RATE, k / RATE, None, HERE, HERE)
+        run.trigger(PlatformPoses(k / RATE, k / RATE, None, HERE, HERE))
         reported += [news for news in run.news() if news.code == "pose_differs"]
     if abs(shift_mm) < 3.0 or images < OFF_IMAGES:
         assert not reported
@@ -327,7 +328,7 @@ def test_a_moving_platform_is_compared_with_the_encoders_at_the_time_of_the_imag
     run: Any = RunCameras([CameraClient(Moving("front", [1], late), "here")], MODEL, 0.0, RATE)
     for k in range(30):
         planned = at_time(k / RATE) if known else None
-        run.trigger(k / RATE, k / RATE, None, planned, planned)
+        run.trigger(PlatformPoses(k / RATE, k / RATE, None, planned, planned))
         assert not run.news()
 
 
@@ -335,7 +336,7 @@ def test_a_moving_platform_is_compared_with_the_encoders_at_the_time_of_the_imag
 def test_a_platform_at_its_planned_or_its_encoder_pose_does_not_differ(off: str) -> None:
     """Drives lag behind a fast path, and wrong tensions shift the encoder pose."""
     monitor, beside = PoseMonitor(_RIG.anchors, 0.003, 0.0), at_time(0.02)
-    found = seen_at(FrameRequest(0, 0.0, 0.0, None)).found
+    found = seen_at(FrameRequest(0, PlatformPoses(0.0, 0.0))).found
     assert isinstance(found, PoseMeasurement)
     planned, encoder = (
         beside if off in (name, "both") else HERE for name in ("planned", "encoder")
@@ -346,7 +347,7 @@ def test_a_platform_at_its_planned_or_its_encoder_pose_does_not_differ(off: str)
 
 def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
     monitor = PoseMonitor(_RIG.anchors, 0.003, 0.0)
-    found = seen_at(FrameRequest(0, 0.0, 0.0, None), 0.02).found
+    found = seen_at(FrameRequest(0, PlatformPoses(0.0, 0.0)), 0.02).found
     assert isinstance(found, PoseMeasurement)
     unstated, common = replace(found, unstated=True), replace(found, shared=1e-4 * np.eye(6))
     assert not any(monitor.take(one, HERE, HERE) for one in [unstated, common] * 20)
@@ -357,7 +358,7 @@ def test_an_image_off_by_its_unstated_error_is_no_difference() -> None:
 def test_the_stated_error_of_the_rig_explains_its_difference(share: float) -> None:
     """95 % along any axis is 1.43 times as much for a distance in space."""
     monitor, error = PoseMonitor(_RIG.anchors, 0.003, 0.01), 0.003 + share * 0.01 * 2.7955 / 1.96
-    found = seen_at(FrameRequest(0, 0.0, 0.0, None), error, deviation=1e-6).found
+    found = seen_at(FrameRequest(0, PlatformPoses(0.0, 0.0)), error, deviation=1e-6).found
     assert isinstance(found, PoseMeasurement)
     assert any(monitor.take(found, HERE, HERE) for _ in range(10)) == (share > 1.0 + 1e-6)
 
@@ -369,7 +370,7 @@ def test_a_platform_rotated_about_its_origin_differs_where_an_anchor_is_too_far_
     monitor, turn = PoseMonitor(_RIG.anchors, 0.003, 0.0), np.radians(degrees) * np.array(axis)
     rotated = Pose(HERE.position, matrix_from_rotation_vector(turn))
     found = replace(
-        seen_at(FrameRequest(0, 0.0, 0.0, None), deviation=1e-6).found,
+        seen_at(FrameRequest(0, PlatformPoses(0.0, 0.0)), deviation=1e-6).found,
         pose=rotated,
         covariance=1e-12 * np.eye(6),
     )
@@ -397,9 +398,9 @@ def test_poses_between_images_follow_a_curve() -> None:
         for k in range(20 * 5):
             time = k / 10.0
             if k % 5 == 0:
-                run.trigger(time, time, None, on_circle(time), on_circle(time))
+                run.trigger(PlatformPoses(time, time, None, on_circle(time), on_circle(time)))
             elif between == 1:
-                run.drive(time, None, on_circle(time), on_circle(time))
+                run.drive(PlatformPoses(time, time, None, on_circle(time), on_circle(time)))
             reported[between] += run.news()
     assert not reported[1]
     assert [news.code for news in reported[5]] == ["pose_differs"]
@@ -414,7 +415,7 @@ def test_each_camera_off_the_encoder_pose_is_named_where_they_disagree(wrong: st
     ]
     run, reported = RunCameras(eyes, MODEL, 0.0, RATE), []
     for k in range(15):
-        run.trigger(k / RATE, k / RATE, None, HERE, HERE)
+        run.trigger(PlatformPoses(k / RATE, k / RATE, None, HERE, HERE))
         reported += [news.text for news in run.news() if news.code == "pose_differs"]
     named = [name for name in shifts if wrong in (name, "both")]
     assert [text.split(" measured")[0] for text in reported] == [f"camera {n}" for n in named]
@@ -438,7 +439,7 @@ def stops(seen: dict[str, tuple[Sequence[float | None], Any]], limit: float) -> 
             if shift is None:
                 samples[name] = sample_without_pose(k, time, "no tag")
                 continue
-            one = seen_at(FrameRequest(k, time, time, None), shift / 1e3, own / 1e3)
+            one = seen_at(FrameRequest(k, PlatformPoses(time, time)), shift / 1e3, own / 1e3)
             shared = np.diag([max(common, operator / 1.96) ** 2 * 1e-6] * 3 + [0.0] * 3)
             found = replace(one.found, shared=shared, cable_error=operator / 1e3)
             samples[name] = replace(one, found=found)
@@ -476,7 +477,7 @@ def test_a_slow_camera_stops_a_run_too(late: int, shift: float) -> None:
     cameras.append(Scripted("slow", [late], shift if near else 0.0))
     run = RunCameras([CameraClient(camera, "here") for camera in cameras], MODEL, limit, RATE)
     for k in range(2 * late + 6):
-        run.trigger(k / RATE, k / RATE, None, None)
+        run.trigger(PlatformPoses(k / RATE, k / RATE))
     assert run.near.endswith("measured by camera slow alone")
 
 
@@ -528,7 +529,7 @@ class Swinging(Scripted):
 
     def answer_within(self, patience: float) -> CameraSample | None:
         if self.unanswered is not None:
-            self._off["shift"] = 0.05 * np.sin(1.5 * (self.unanswered.time + self._behind))
+            self._off["shift"] = 0.05 * np.sin(1.5 * (self.unanswered.poses.time + self._behind))
         return super().answer_within(patience)
 
 
@@ -622,7 +623,7 @@ def test_signals_to_all_processes_of_a_terminal_end_no_camera() -> None:
         wait_until_ready([process], lambda: None)
         for number in signals:
             os.kill(child("front"), number)
-        process.ask(FrameRequest(1, 0.0, 0.0, None))
+        process.ask(FrameRequest(1, PlatformPoses(0.0, 0.0)))
         assert process.answer_within(60.0) is not None
     assert not [c for c in multiprocessing.active_children() if c.name.startswith("cdpr-camera")]
 
@@ -643,7 +644,7 @@ def test_in_real_time_a_process_that_hangs_is_reported_while_the_other_measures(
         while not reported:
             now += 1.0 / RATE
             assert now < 60.0, "it is reported soon"
-            run.trigger(now, now, None, None)
+            run.trigger(PlatformPoses(now, now))
             reported += [news.text for news in run.news()]
             if how == "stopped" and len(eyes[1].samples) == 3:
                 os.kill(child("side"), signal.SIGSTOP)

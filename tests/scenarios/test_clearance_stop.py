@@ -13,7 +13,7 @@ import yaml
 
 from executor.cameras.process import CameraWorker, FrameRequest
 from executor.recording.run_folder import RunFolder
-from executor.state_machine import State
+from executor.state_machine import PlatformPoses, State
 from executor.supervision import StopReason
 from executor.trajectory.setpoints import PreparedRun
 from model.clearance import ClearanceModel
@@ -162,8 +162,8 @@ class Rendered:
         self._camera = camera
 
     def image(self, trigger: FrameRequest) -> tuple[np.ndarray, float]:
-        assert trigger.true_pose is not None
-        return self._camera.render(trigger.true_pose, trigger.frame), 0.0
+        assert trigger.poses.true is not None
+        return self._camera.render(trigger.poses.true, trigger.frame), 0.0
 
     def close(self) -> None:
         pass
@@ -179,7 +179,9 @@ def test_one_image_alone_does_not_stop_a_run(narrow_plan: Path, tmp_path: Path) 
     with CameraWorker(rig, rig.cameras[0], Rendered(eye), folder, 1000, named=False) as observer:
         reported = []
         for frame, pose in enumerate([near, far, near, near, far]):
-            found = observer.measure(FrameRequest(frame, frame * 0.1, 0.0, pose)).found
+            found = observer.measure(
+                FrameRequest(frame, PlatformPoses(frame * 0.1, 0.0, pose))
+            ).found
             assert isinstance(found, PoseMeasurement)
             reported.append(bool(watch.take(clearance_of(model, found))))
     assert reported == [False, False, False, True, False]

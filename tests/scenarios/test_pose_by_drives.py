@@ -10,7 +10,7 @@ import numpy as np
 from executor.cameras.multi_camera import CameraRecords
 from executor.evaluation import _clearance
 from executor.recording.recorder import RunLog
-from executor.state_machine import CycleRecord, State
+from executor.state_machine import CycleRecord, PlatformPoses, State
 from executor.trajectory.setpoints import PreparedRun
 from model.kinematics import cable_lengths
 from model.pose import Pose, interpolate, matrix_from_rotation_vector
@@ -24,10 +24,8 @@ def test_each_image_comes_with_the_drives_pose_of_its_own_time(
     """The table of the whole run is computed differently: all cycles at once, near the plan."""
     requests: list[tuple[float, Pose | None]] = []
 
-    def trigger(
-        time: float, asked: float, true_pose: Pose | None, encoder_pose: Pose | None, *_: object
-    ) -> None:
-        requests.append((time, encoder_pose))
+    def trigger(poses: PlatformPoses, _is_due: bool) -> None:
+        requests.append((poses.time, poses.encoder))
 
     with staged(prepared, tmp_path / "run", lambda _stage: None) as stage:
         cycles = stage.run(trigger=trigger).log.table()
