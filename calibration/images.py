@@ -302,7 +302,7 @@ def _sampled(video: VideoFile, most: int, total: int | None = None) -> ImageSet:
     total = video.readable if total is None else total
     count = min(most, total)
     numbers = {k * total // count for k in range(count)}
-    return ImageSet(_Sample(video, numbers), count, video=video)
+    return ImageSet(_Sample(video, numbers), count, video.unused, video)
 
 
 @dataclass(frozen=True, slots=True)

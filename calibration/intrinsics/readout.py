@@ -75,7 +75,7 @@ def open_timed_images(
     video = VideoFile(source, camera, rate)
     if video.remark:
         listener.remark(video.remark)
-    return ImageSet(_named_by_time(video, times), len(video)), times
+    return ImageSet(_named_by_time(video, times), len(video), video.unused), times
 
 
 def _named_by_time(frames: Iterable[Frame], times: dict[str, float]) -> Iterator[tuple[str, Image]]:

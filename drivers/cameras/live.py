@@ -73,6 +73,9 @@ class FrameSource:
 #: and a NAL unit, ITU-T H.264, annex B). MPEG streams of other kinds have larger numbers there. A
 #: box of an MP4 or MOV file begins with its size in four bytes, which may look like a start code.
 _NO_TIMES = re.compile(rb"\xff\xd8|\s*--|\x00{2,}\x01(?!mdat|.(?:ftyp|moov))[\x00-\x7f]", re.DOTALL)
+#: Begin of a file that lists its images, AVI or MP4; elsewhere FFmpeg estimates their number.
+_LISTED = re.compile(rb"(RIFF)|....(?:ftyp|moov|mdat|wide|free|skip)", re.DOTALL)
+_ATTEMPTS = 25  # to read the next image before the video counts as over: a part may be damaged
 
 
 class VideoFile(FrameSource):
@@ -88,6 +91,7 @@ class VideoFile(FrameSource):
         rate: Images per second that the file states (default: as given), [Hz].
         remark: That a rate was assumed, for the operator; empty if the file states its times or
             `rate` was given.
+        unused: How many images could not be read, and why; empty until all were read.
 
     Raises:
         BadInput: The file is missing, or is not a video, or is an image of several pages; its
@@ -116,6 +120,7 @@ class VideoFile(FrameSource):
             )
         count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self._count = max(0, int(count)) if 0 <= count < 1e9 else 0
+        self.unused: dict[str, str] = {}
         self._set_rate(capture.get(cv2.CAP_PROP_FPS), rate)
         width, height = _size(capture)
         capture.release()
@@ -129,7 +134,8 @@ class VideoFile(FrameSource):
 
     def _set_rate(self, stated: float, given: float | None) -> None:
         with self._path.open("rb") as file:
-            self._has_times = _NO_TIMES.match(file.read(64)) is None
+            head = file.read(64)
+        self._has_times, self._listed = _NO_TIMES.match(head) is None, _LISTED.match(head)
         if self._has_times and given is not None:
             raise BadInput(
                 "a rate can be given for a folder of images, or a video without times",
@@ -152,11 +158,7 @@ class VideoFile(FrameSource):
 
     @cached_property
     def readable(self) -> int:
-        """Number of its images, counted by reading all; that which the file states may be wrong.
-
-        Raises:
-            BadInput: As when they are read.
-        """
+        """Number of its images, by reading all; the one that it states may be wrong."""
         return sum(1 for _ in self)
 
     def __iter__(self) -> Iterator[Frame]:
@@ -166,12 +168,14 @@ class VideoFile(FrameSource):
             BadInput: They have another size than the camera, or none can be read.
         """
         capture = _opened_video(self._path, self._camera)
-        number, seconds, begin = 0, -1.0 / self.rate, 0.0
+        number, seconds, begin, failed, lost = 0, -1.0 / self.rate, 0.0, 0, 0
         try:
-            while True:
+            while failed < _ATTEMPTS:
                 good, picture = capture.read()
                 if not good:
-                    break
+                    failed += 1
+                    continue
+                failed, lost = 0, lost + failed
                 image = _grey(np.asarray(picture))
                 stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3  # the rate may vary
                 if number == 0:
@@ -186,6 +190,11 @@ class VideoFile(FrameSource):
             capture.release()
         if number == 0:
             raise BadInput("the video has no readable image", where=str(self._path))
+        if lost := max(lost, self._count - number if self._listed else 0):
+            why = "could not be read: the file is damaged, incomplete, or cut without re-encoding"
+            if self._listed and self._listed[1]:  # AVI states no times
+                why += "; the times after the first of them may be too early"
+            self.unused[f"{lost} of {number + lost} images of {self._path.name}"] = why
 
 
 class LiveCamera(FrameSource):

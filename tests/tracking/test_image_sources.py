@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -359,19 +359,31 @@ def test_a_video_is_measured_picture_by_picture(
         assert result.observation.pose.distance_to(truth) < 2e-3
 
 
-class Capture:
-    """Images with the times of a container, whose rate varies."""
+def video_of(path: Path, camera: Camera, images: int) -> Path:
+    """Black images of the camera's size, 10 per second."""
+    size, code = (camera.width, camera.height), cv2.VideoWriter.fourcc(*"MJPG")
+    writer = cv2.VideoWriter(str(path), code, 10.0, size, isColor=False)
+    for _ in range(images):
+        writer.write(np.zeros(size[::-1], np.uint8))
+    writer.release()
+    return path
 
-    def __init__(self, times_ms: list[float], size: tuple[int, int]) -> None:
+
+class Capture:
+    """Images with the times of a container, whose rate varies; None where one is damaged."""
+
+    def __init__(self, times_ms: Sequence[float | None], size: tuple[int, int]) -> None:
         self._times, self._size, self._at = times_ms, size, -1
 
     def read(self) -> tuple[bool, np.ndarray | None]:
         self._at += 1
-        good = self._at < len(self._times)
+        good = self._at < len(self._times) and self._times[self._at] is not None
         return good, np.zeros(self._size, np.uint8) if good else None
 
     def get(self, what: int) -> float:
-        return self._times[self._at] if what == cv2.CAP_PROP_POS_MSEC else 10.0
+        time = self._times[self._at] if what == cv2.CAP_PROP_POS_MSEC else 10.0
+        assert time is not None
+        return time
 
     def set(self, what: int, value: float) -> bool:
         return False
@@ -400,16 +412,36 @@ def test_a_video_may_change_its_rate(
     stated: list[float],
     expected: list[float],
 ) -> None:
-    path = tmp_path / "run.avi"
-    writer = cv2.VideoWriter(
-        str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (camera.width, camera.height), False
-    )
-    writer.write(np.zeros((camera.height, camera.width), np.uint8))
-    writer.release()
-    video = VideoFile(path, camera)
+    video = VideoFile(video_of(tmp_path / "run.avi", camera, 1), camera)
     capture = Capture(stated, (camera.height, camera.width))
     monkeypatch.setattr("drivers.cameras.live._opened", lambda _path: capture)
     assert [frame.time for frame in video] == pytest.approx(expected)
+
+
+def test_what_follows_a_damaged_part_of_a_video_is_read(
+    tmp_path: Path, camera: Camera, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    video = VideoFile(video_of(tmp_path / "run.avi", camera, 1), camera)
+    capture = Capture([0.0, 100.0, None, None, 400.0], (camera.height, camera.width))
+    monkeypatch.setattr("drivers.cameras.live._opened", lambda _path: capture)
+    assert [frame.time for frame in video] == pytest.approx([0.0, 0.1, 0.4])
+    assert list(video.unused) == ["2 of 5 images of run.avi"]
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_images_that_a_cut_video_lacks_are_counted(
+    tmp_path: Path, camera: Camera, share: float
+) -> None:
+    small = replace(camera, width=64, height=48)
+    path = video_of(tmp_path / "run.avi", small, 40)
+    video = VideoFile(path, small)
+    assert video.readable == 40
+    assert video.unused == {}
+    path.write_bytes(path.read_bytes()[: round(share * path.stat().st_size)])
+    cut = VideoFile(path, small)
+    assert 0 < cut.readable < 40
+    (lost,) = cut.unused
+    assert lost == f"{40 - cut.readable} of 40 images of run.avi"
 
 
 @pytest.mark.parametrize("over_http", [False, True])
