@@ -221,7 +221,7 @@ def track_sources(
         for camera, source in sources.items()
     ]
     result.unused = {
-        camera.name: frames.unused if isinstance(frames, ImageFolder) else {}
+        camera.name: frames.unused if isinstance(frames, ImageFolder | VideoFile) else {}
         for camera, (frames, _) in zip(sources, opened, strict=True)
     }
     opened, within = _simultaneous(list(sources), opened, listener)
@@ -255,12 +255,12 @@ def track_sources(
         finally:
             for text in skipped_files(result.unused_files()):
                 listener.remark(text)
-    for text in result.together.remarks if result.together is not None else ():
-        listener.remark(text)
-    for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
-        skipped = (frames.late, frames.truncated) if isinstance(frames, LiveCamera) else (0, 0)
-        for text in _not_measured(check.count, *skipped):
-            listener.remark(f"camera {camera.name}: {text}")
+            for text in result.together.remarks if result.together is not None else ():
+                listener.remark(text)
+            for camera, (frames, _), check in zip(sources, opened, copies, strict=True):
+                live = (frames.late, frames.truncated) if isinstance(frames, LiveCamera) else (0, 0)
+                for text in _not_measured(check.count, *live):
+                    listener.remark(f"camera {camera.name}: {text}")
     return result
 
 

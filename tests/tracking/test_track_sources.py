@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from drivers.cameras.live import Frame
 from executor.track import track_sources
 from model.cameras import Z_95
-from model.errors import BadInput, StoppedByOperator
+from model.errors import BadInput, Fault, StoppedByOperator
 from model.pose import Pose
 from model.progress import Listener
 from model.rig import Camera, Rig
@@ -138,6 +138,26 @@ class Remarks(Listener):
 
     def remark(self, text: str) -> None:
         self.texts.append(text)
+
+
+def test_skipped_images_are_counted_when_the_camera_is_lost_too(
+    rig: Rig, scene: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Live:
+        late, truncated = 3, 0
+
+        def __init__(self, _source: str, camera: Camera, **_: object) -> None:
+            self._image = SyntheticCamera(rig, scene, camera, seed=4).render(rig.home, 0)
+
+        def __iter__(self) -> Iterator[Frame]:
+            yield Frame(5.0, self._image, "image 0")
+            raise Fault("the camera delivers no more images")
+
+    monkeypatch.setattr("executor.track.LiveCamera", Live)
+    listener = Remarks()
+    with pytest.raises(Fault, match="no more images"):
+        track_sources(rig, {rig.cameras[0]: "0"}, listener=listener)
+    assert "3 images came late and were skipped" in "; ".join(listener.texts)
 
 
 def test_live_cameras_with_different_latencies_measure_the_platform_where_it_was(
