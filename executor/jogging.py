@@ -75,7 +75,8 @@ def jog(
 
     Args:
         rig: The robot and its bus.
-        scene: Obstacles and load; its stops are ignored. None states that there are no obstacles.
+        scene: Obstacles and load; its stops are ignored. None states that there are no obstacles;
+            cables then keep 5 mm from each other and from the platform.
         by: Displacement, shape (3,), in the world frame, [m].
         to_home: Move to the rig's home pose instead, with its orientation.
         speed: At most the rig's own, [m/s].
