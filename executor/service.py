@@ -23,7 +23,7 @@ from drivers.factory import (
     unready_remarks,
     without_torque,
 )
-from drivers.plausibility import HOMING_OPTIONS
+from drivers.plausibility import HOMING_POSE
 from executor.control.standstill import (
     FaultReset,
     Release,
@@ -143,7 +143,7 @@ class StatusResult(FactsDisplay):
         if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
             steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")
         if self.reference.why_lost is not None:
-            steps.append(f"cdpr home {file} with {HOMING_OPTIONS}")
+            steps.append(f"cdpr home {file} with {HOMING_POSE}")
         return "; then ".join(steps)
 
     def drive_lines(self, names: Mapping[int, str]) -> list[str]:

@@ -89,8 +89,10 @@ def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
     with pytest.raises(Refused) as beyond:
         require_within_limits(rig, dict.fromkeys(range(8), 2**31 - 1), "unchanged")
     for caught in (unhomed, moved, beyond):
-        wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE"
-        assert wanted in caught.value.next_step
+        wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE, in Python"
+        assert f"{wanted} cdpr.home() with at_home=True, pose= or camera=;" in (
+            caught.value.next_step
+        )
 
 
 def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
