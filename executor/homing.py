@@ -240,6 +240,10 @@ def reference_at(
 def use_rig_file_counts(rig: Rig, *, confirm: Callable[[Proposal], bool] | None = None) -> None:
     """Discards the reference: absolute encoders count as in the rig file. Moves nothing.
 
+    Args:
+        rig: The robot and its bus.
+        confirm: Called once, before anything is discarded; False cancels it.
+
     Raises:
         Refused: The bus is latched, not all encoders are absolute, or encoders lost turns.
         StoppedByOperator: Cancelled.

@@ -685,7 +685,8 @@ def test_a_loss_of_drives_never_homed_names_the_way_out_for_absolute_encoders() 
         interlock = MotionInterlock(rig_with(encoder))
         with pytest.raises(Refused, match="is lost") as refused:
             interlock.reference()
-        assert ("--as-rig-file" in refused.value.next_step) is (encoder == "absolute")
+        way = "`cdpr home RIG --as-rig-file` instead, in Python executor.use_rig_file_counts()"
+        assert (way in refused.value.next_step) is (encoder == "absolute")
     interlock.use_rig_file_counts()
     assert interlock.reference() is None
 
