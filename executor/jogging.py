@@ -202,7 +202,8 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
         raise BadInput(
             "no motion given: use `by=` or `to_home=`, or jog a single cable",
             where="cdpr jog",
-            next_step="see `cdpr jog --help`",
+            next_step="see `cdpr jog --help`; in Python pass by= or to_home=True, or use"
+            " executor.jog_cable()",
         )
     if by is None:
         return

@@ -130,7 +130,7 @@ class StatusResult(FactsDisplay):
         next_step = self.next_step(rig_file)
         return [*facts, ("next", next_step)] if next_step else facts
 
-    def next_step(self, rig_file: Path) -> str:
+    def next_step(self, rig_file: Path = Path("RIG")) -> str:
         """Next step before a run; empty if none is needed or a run is active."""
         if self.run is not None or self.being_set_up:
             return ""

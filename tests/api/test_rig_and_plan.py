@@ -747,7 +747,10 @@ def test_messages_of_the_library_name_what_a_script_passes(rig: cdpr.Rig) -> Non
         cdpr.home(rig)
     with pytest.raises(cdpr.Refused, match=r"a jog of 60\.0 mm") as far:
         cdpr.jog(rig, None, by=[0.0, 0.0, 0.06])
+    with pytest.raises(cdpr.BadInput, match="no motion given") as unmoved:
+        cdpr.jog(rig, None)
     for caught, option, argument in (
+        (unmoved, "--help", "in Python pass by= or to_home=True, or use executor.jog_cable()"),
         (without, "--no-camera", "cameras=[]"),
         (unnamed, "--camera INDEX", "cameras=INDEX"),
         (virtual, "--interface", "rig.with_bus"),

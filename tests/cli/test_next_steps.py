@@ -226,6 +226,7 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
     assert STANDING.next_step(rig) == ""
     lost = replace(STANDING, reference=replace(REFERENCED, counts=False, why_not="never homed"))
     assert lost.next_step(rig).startswith("cdpr home 'my rig.yaml'")
+    assert lost.next_step().startswith("cdpr home RIG with")
     assert lost.next_step(rig).endswith("cdpr.home() with at_home=True, pose= or camera=")
     both = replace(lost, latched="cable 3 is slack").next_step(rig)
     assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
