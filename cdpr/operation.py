@@ -42,6 +42,8 @@ from planner.settings import (
 from planner.workspace.compute import Maps, map_workspace, workspace_grids
 from planner.workspace.maps import Question
 
+__all__ = ["check", "hold", "plan", "report", "resume", "set_speed", "stop", "workspace_map"]
+
 #: Largest number of processes that share a map.
 MOST_WORKERS = 1024
 

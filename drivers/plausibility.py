@@ -19,7 +19,10 @@ BAD_CYCLES = 2
 HOMING_OPTIONS = "--at-home, --pose-mm X Y Z or --camera SOURCE"
 """One of them states or measures the pose for `cdpr home`."""
 
-HOME = f"`cdpr home RIG` with {HOMING_OPTIONS}"
+HOMING_POSE = f"{HOMING_OPTIONS}, in Python cdpr.home() with at_home=True, pose= or camera="
+"""The same for every caller."""
+
+HOME = f"`cdpr home RIG` with {HOMING_POSE}"
 """The next step for drives without a valid reference."""
 
 JUMP_RESERVE, JUMP_COUNTS = 4.0, 8.0

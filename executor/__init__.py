@@ -8,7 +8,7 @@ from model.lazy import lazy_names
 
 if TYPE_CHECKING:
     from executor.doctor import check_rig
-    from executor.homing import home
+    from executor.homing import home, use_rig_file_counts
     from executor.jogging import jog, jog_cable
     from executor.recording.run_folder import RunFolder
     from executor.report import build_report
@@ -30,6 +30,7 @@ __all__ = [
     "reset",
     "run",
     "status",
+    "use_rig_file_counts",
 ]
 
 if not TYPE_CHECKING:
@@ -37,7 +38,7 @@ if not TYPE_CHECKING:
         __name__,
         {
             "executor.doctor": "check_rig",
-            "executor.homing": "home",
+            "executor.homing": "home use_rig_file_counts",
             "executor.jogging": "jog jog_cable",
             "executor.recording.run_folder": "RunFolder",
             "executor.report": "build_report",

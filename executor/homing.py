@@ -31,7 +31,7 @@ from executor.proposals import Facts, Proposal, forget_proposal, homing_proposal
 from executor.realtime.scheduling import require_imported_script
 from executor.remote.command_server import commands_from_start
 from executor.supervision import RequestBoard, Supervisor
-from executor.winch_runs import limit_of, move_by_law
+from executor.winch_runs import limit_of, move_by_law, record_folder
 from model.errors import (
     BadInput,
     Refused,
@@ -73,13 +73,15 @@ class HomeResult(FactsDisplay):
     Attributes:
         reference: Homing reference of the drives.
         file: Its file; None with simulated drives, which end with their process.
+        folder: Record of the motion, as an absolute path; None without one.
     """
 
     reference: HomingReference
     file: Path | None
+    folder: Path | None = None
 
     def facts(self) -> Facts:
-        """Human-readable pose, uncertainty, tensions and file."""
+        """Human-readable pose, uncertainty, tensions, file and record."""
         reference, tensions = self.reference, self.reference.tensions_n
         x, y, z = reference.pose.position_mm
         known = f"{reference.uncertainty_mm:.3f} mm (one standard deviation)"
@@ -91,6 +93,7 @@ class HomeResult(FactsDisplay):
             ("uncertainty", known),
             ("tensions", f"{min(tensions):.1f} to {max(tensions):.1f} N"),
             ("reference", str(kept)),
+            *([("record", str(self.folder))] if self.folder else []),
         ]
 
 
@@ -106,6 +109,7 @@ def home(
     speed: float = SPEED,
     pictures: int = PICTURES,
     simulated_slack: float = SLACK,
+    folder: Path | str | None = None,
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
@@ -131,6 +135,8 @@ def home(
         speed: Largest winch speed, [m/s].
         pictures: Number of images for the pose.
         simulated_slack: Largest slack of simulated cables, [m].
+        folder: Record folder to create; None for ``runs/home``, ``runs/home-2`` …, and for none
+            with simulated drives.
         realtime: False for simulated time, as fast as possible.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
@@ -167,6 +173,7 @@ def home(
     targets = _targets(rig, tension, known, limit)
     speed = min(speed, rig.motion.speed)
     law = _winding_in(rig, known or rig.home, targets, limit, reach, speed)
+    make_folder = record_folder(rig, folder, "home")
     interlock = MotionInterlock(rig)
     made: list[HomingReference] = []
 
@@ -188,11 +195,11 @@ def home(
             made.append(_referenced(rig, result, true_pose, board, known, source, pictures))
             return made[0]
 
-        move_by_law(
+        result = move_by_law(
             rig,
             commands,
             law,
-            "home",
+            make_folder,
             pose=known or rig.home,
             limit=limit,
             speed=speed,
@@ -204,7 +211,7 @@ def home(
             at_rest=at_rest,
         )
     (reference,) = made
-    return HomeResult(reference, None if in_process else interlock.file.path)
+    return HomeResult(reference, None if in_process else interlock.file.path, result.folder)
 
 
 def reference_at(
@@ -239,6 +246,10 @@ def reference_at(
 
 def use_rig_file_counts(rig: Rig, *, confirm: Callable[[Proposal], bool] | None = None) -> None:
     """Discards the reference: absolute encoders count as in the rig file. Moves nothing.
+
+    Args:
+        rig: The robot and its bus.
+        confirm: Called once, before anything is discarded; False cancels it.
 
     Raises:
         Refused: The bus is latched, not all encoders are absolute, or encoders lost turns.

@@ -23,7 +23,7 @@ from executor.run_result import folder_maker
 from executor.runner import RunOptions, RunResult, run_prepared
 from executor.supervision import Supervisor
 from executor.trajectory.setpoints import prepare_plan
-from executor.winch_runs import limit_of, move_by_law
+from executor.winch_runs import limit_of, move_by_law, record_folder
 from model.errors import (
     BadInput,
     Refused,
@@ -75,7 +75,8 @@ def jog(
 
     Args:
         rig: The robot and its bus.
-        scene: Obstacles and load; its stops are ignored. None states that there are no obstacles.
+        scene: Obstacles and load; its stops are ignored. None states that there are no obstacles;
+            cables then keep 5 mm from each other and from the platform.
         by: Displacement, shape (3,), in the world frame, [m].
         to_home: Move to the rig's home pose instead, with its orientation.
         speed: At most the rig's own, [m/s].
@@ -201,7 +202,8 @@ def require_distance(by: Array | None, *, to_home: bool) -> None:
         raise BadInput(
             "no motion given: use `by=` or `to_home=`, or jog a single cable",
             where="cdpr jog",
-            next_step="see `cdpr jog --help`",
+            next_step="see `cdpr jog --help`; in Python pass by= or to_home=True, or use"
+            " executor.jog_cable()",
         )
     if by is None:
         return
@@ -260,18 +262,21 @@ class CableJog(FactsDisplay):
         cable: Its number, from 1.
         moved: Length paid out from the encoder, [m]; negative for wound in.
         tensions: Of all cables afterwards, shape (m,), [N].
+        folder: Record of the motion, as an absolute path; None without one.
     """
 
     cable: int
     moved: float
     tensions: Array
+    folder: Path | None = None
 
     def facts(self) -> Facts:
-        """Human-readable travel and tensions."""
+        """Human-readable travel, tensions and record."""
         way = "paid out" if self.moved > 0.0 else "wound in"
         return [
             ("cable", f"{self.cable}, {way} by {abs(self.moved) * 1000.0:.3f} mm"),
             ("tensions", f"{self.tensions.min():.1f} to {self.tensions.max():.1f} N"),
+            *([("record", str(self.folder))] if self.folder else []),
         ]
 
 
@@ -282,6 +287,7 @@ def jog_cable(
     *,
     limit: float | None = None,
     speed: float = SPEED,
+    folder: Path | str | None = None,
     realtime: bool = True,
     need_real_time_rights: bool = True,
     listener: Listener = SILENT,
@@ -299,6 +305,8 @@ def jog_cable(
         length: To pay out, [m]; negative winds in.
         limit: Largest tension of any cable, [N]; None for 60 % of the rig's range.
         speed: At most the rig's own, [m/s].
+        folder: Record folder to create; None for ``runs/jog-cable``, ``runs/jog-cable-2`` …, and
+            for none with simulated drives.
         realtime: As for `executor.runner.run`, like all that follow.
         need_real_time_rights: Refuse to move drives on a bus without real-time scheduling.
         listener: Receives progress.
@@ -323,6 +331,7 @@ def jog_cable(
     winch = slow.winches[cable - 1]
     limit = limit_of(slow, limit)
     fastest = slow.motion.speed
+    make_folder = record_folder(slow, folder, "jog-cable")
     with commands_from_start("jog", slow, supervisor, realtime=realtime) as commands:
         MotionInterlock(slow).require_free()
         require_confirmed(confirm, cable_proposal(slow, cable, length, limit, fastest))
@@ -330,7 +339,7 @@ def jog_cable(
             slow,
             commands,
             partial(CableStep, cable=cable - 1, length=length, limit=limit, speed=fastest),
-            "jog-cable",
+            make_folder,
             pose=slow.home,
             limit=limit,
             speed=fastest,
@@ -339,4 +348,4 @@ def jog_cable(
             listener=listener,
         )
     moved = (result.counts - result.began)[cable - 1] / winch.counts_per_metre
-    return CableJog(cable, float(moved), result.tensions)
+    return CableJog(cable, float(moved), result.tensions, result.folder)

@@ -23,7 +23,7 @@ from drivers.factory import (
     unready_remarks,
     without_torque,
 )
-from drivers.plausibility import HOMING_OPTIONS
+from drivers.plausibility import HOMING_POSE
 from executor.control.standstill import (
     FaultReset,
     Release,
@@ -49,7 +49,7 @@ from executor.proposals import Facts, Proposal, release_proposal, require_confir
 from executor.realtime.process import RealTimeProcess, real_time_process
 from executor.realtime.scheduling import require_imported_script
 from executor.realtime.shared_memory import SharedRequests
-from executor.remote.client import preparations
+from executor.remote.client import motions_on
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
@@ -130,7 +130,7 @@ class StatusResult(FactsDisplay):
         next_step = self.next_step(rig_file)
         return [*facts, ("next", next_step)] if next_step else facts
 
-    def next_step(self, rig_file: Path) -> str:
+    def next_step(self, rig_file: Path = Path("RIG")) -> str:
         """Next step before a run; empty if none is needed or a run is active."""
         if self.run is not None or self.being_set_up:
             return ""
@@ -143,7 +143,7 @@ class StatusResult(FactsDisplay):
         if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
             steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")
         if self.reference.why_lost is not None:
-            steps.append(f"cdpr home {file} with {HOMING_OPTIONS}")
+            steps.append(f"cdpr home {file} with {HOMING_POSE}")
         return "; then ".join(steps)
 
     def drive_lines(self, names: Mapping[int, str]) -> list[str]:
@@ -207,7 +207,10 @@ def status(rig: Rig) -> StatusResult:
     latch = FaultLatch(settings, rig.drive_names)
     latched, run = latch.read_in_motion()
     refusal = latch.why_not_reset(rig.name, latched) if latched else None
-    preparing = tuple(one["process"] for one in preparations(bus_name(rig)))
+    motions = motions_on(bus_name(rig))  # also armed without the latch yet, or no longer with it
+    moving = [process for process, state in motions.items() if state != "preparing"]
+    run = next(iter(moving), None) if run is None else run
+    preparing = tuple(process for process in motions if process not in (run, *moving))
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),
@@ -235,11 +238,8 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     Raises:
         CdprError: A drive fails while it is read, or the bus cannot be opened.
     """
-    bus = open_bus(BusSettings.of(rig))
-    try:
+    with open_bus(BusSettings.of(rig)) as bus:
         seen = read_drives(rig, bus, partial=True)
-    finally:
-        bus.shutdown()
     known = replace(known, drives=drive_statuses(rig, seen) or None, silent=seen.silent)
     if seen.silence is not None:
         unread = known.reference.if_unread(seen.silence.what)
@@ -258,13 +258,11 @@ def _read(rig: Rig, interlock: MotionInterlock, known: StatusResult) -> StatusRe
     read = replace(known, reference=reference, how_to_reset=known.how_to_reset or how)
     if not reference.counts:
         return read
-    as_referenced = interlock.referenced_rig()
-    load = empty_scene(as_referenced).load
+    counts, referenced = seen.positions.astype(np.float64), interlock.referenced_rig()
     try:
-        pose = current_pose(as_referenced, np.array(positions, dtype=np.float64), load)
+        return replace(read, pose=current_pose(referenced, counts, empty_scene(referenced).load))
     except CdprError as error:
         return replace(read, why_no_pose=error.what)
-    return replace(read, pose=pose)
 
 
 @dataclass(frozen=True, slots=True, repr=False)

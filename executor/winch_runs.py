@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from executor.control.winch_loop import LawMotion, MakeLaw
@@ -27,11 +28,12 @@ from executor.realtime.process import MotionHere, Mover, real_time_process
 from executor.realtime.scheduling import Clock, SimulatedClock
 from executor.realtime.shared_memory import SharedRequests
 from executor.recording.record_files import free_folder
+from executor.recording.run_folder import RunFolder
 from executor.remote.command_server import Commands
 from executor.remote.status import WinchStatus
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
 from executor.supervision import LocalRequests
-from model.errors import Fault, Refused, StoppedByOperator, real_number
+from model.errors import Fault, Refused, StoppedByOperator, path_of, real_number
 from model.pose import Pose
 from model.progress import Listener
 from model.rig import Rig
@@ -65,11 +67,29 @@ def limit_of(rig: Rig, limit: float | None) -> float:
     return limit
 
 
+def record_folder(rig: Rig, folder: Path | str | None, name: str) -> Callable[[], Path] | None:
+    """Names the record folder of a motion when called, after its preparation; None for no record.
+
+    Args:
+        rig: The robot and its bus.
+        folder: Which does not exist yet; None for ``runs/NAME``, with the first number that is free
+            then, except with simulated drives, which leave no record.
+        name: For None.
+
+    Raises:
+        BadInput: It could not be created now.
+    """
+    if folder is None:
+        return None if is_simulated(rig) else partial(free_folder, name)
+    RunFolder.require_free(given := path_of(folder))
+    return lambda: given
+
+
 def move_by_law(
     rig: Rig,
     commands: Commands,
     make_law: MakeLaw,
-    name: str,
+    make_folder: Callable[[], Path] | None,
     *,
     pose: Pose,
     limit: float,
@@ -87,7 +107,7 @@ def move_by_law(
         rig: The robot and its bus.
         commands: Those taken since the start of the verb.
         make_law: See `MakeLaw`; picklable.
-        name: Of the record folder in ``runs`` of a motion on a bus.
+        make_folder: See `record_folder`.
         pose: Approximate pose of its platform, ``world_from_platform``.
         limit: Largest tension, [N].
         speed: Fastest winch, [m/s].
@@ -112,7 +132,7 @@ def move_by_law(
             LawMotion(rig.cable_count, rig.cycle, make_law, limit, speed),
             partial(unreferenced_drives_of, rig.document, pose, limit, lost_power),
             WinchStatus(rig, commands.board, simulated_time=not realtime),
-            name,
+            make_folder,
             clock=SimulatedClock(rig.cycle),
             need_real_time_rights=need_real_time_rights,
             listener=listener,
@@ -212,7 +232,7 @@ def move_supervised(
     task: MotionTask,
     make_drives: Callable[..., AbstractContextManager[ReadyDrives]],
     status: WinchStatus,
-    name: str,
+    make_folder: Callable[[], Path] | None,
     *,
     clock: Clock,
     need_real_time_rights: bool,
@@ -229,14 +249,14 @@ def move_supervised(
         commands: Those taken since the start of the verb.
         make_drives: See `open_mover`.
         status: Answers on the command socket.
-        name: Of the record folder in ``runs``; simulated drives leave none.
+        make_folder: See `record_folder`.
         showing: Called after every cycle, before the status.
         presses: Where the command socket writes held controls.
         unreported: Codes of events that the listener does not get.
         rehome: The drives are referenced again afterwards.
         at_rest: See `AtRest`.
     """
-    interlock, simulated = MotionInterlock(rig), is_simulated(rig)
+    interlock = MotionInterlock(rig)
     with ExitStack() as stack:
         stack.enter_context(commands.during_motion(status, presses))
         moving = stack.enter_context(
@@ -250,7 +270,7 @@ def move_supervised(
                 listener=listener,
             )
         )
-        log = stack.enter_context(nullcontext() if simulated else recording(free_folder(name)))
+        log = stack.enter_context(recording(make_folder()) if make_folder else nullcontext())
         if log is not None:
             status.take_folder(log.folder)
         result = move_winches(
@@ -263,7 +283,7 @@ def move_supervised(
             at_rest=at_rest,
         )
         status.take_end(result.state, result.cause)
-    return result
+    return result if log is None else replace(result, folder=log.folder.absolute())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

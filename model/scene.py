@@ -262,11 +262,15 @@ def scene_from_document(document: SceneDocument) -> Scene:
     )
 
 
+#: Name of `empty_scene`.
+NO_SCENE = "no scene"
+
+
 def empty_scene(rig: Rig) -> Scene:
-    """A scene without obstacles and load, with the platform at home."""
+    """A scene without obstacles and load, with the platform at home and default clearances."""
     home = PoseDocument.of(rig.home)
     return scene_from_document(
-        SceneDocument(schema_version=1, name="no scene", start=home, goal=home)
+        SceneDocument(schema_version=1, name=NO_SCENE, start=home, goal=home)
     )
 
 

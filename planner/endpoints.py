@@ -13,7 +13,7 @@ from model.files.new_rig import CABLES_MOST
 from model.kinematics import NoCable, axis_distances, structure_matrix
 from model.pose import Pose
 from model.rig import Rig
-from model.scene import Leg, Scene, empty_scene, legs_of
+from model.scene import NO_SCENE, Leg, Scene, empty_scene, legs_of
 from model.shapes import Sphere
 from model.statics.feasibility import limiting_cables
 from model.statics.gravity import inertial_wrench, working_tensions
@@ -158,8 +158,7 @@ def _require_outer_anchors(rig: Rig, scene: Scene) -> None:
         where=f"rig {rig.name}",
         why=f"only the first {stub * 1e3:.1f} mm of a cable, a quarter of the shortest side of the"
         " box, may be nearer",
-        next_step=f"{deep if most >= 0.0 else 'declare a thicker box'}, or reduce clearance.self_mm"
-        " in the scene",
+        next_step=f"{deep if most >= 0.0 else 'declare a thicker box'}, or {_nearer_cables(scene)}",
         values={"cable": cable + 1, "depth_mm": depth * 1e3, "required_mm": needed * 1e3},
     )
 
@@ -223,7 +222,7 @@ def _require_clear(scene: Scene, model: ClearanceModel, name: str, pose: Pose) -
         if near.distance < needed:
             if key == "obstacle_mm":
                 _require_clear_outlet(model.rig, scene, near, needed)
-            raise _clearance_error(name, near, needed, key, model.rig)
+            raise _clearance_error(scene, name, near, needed, key, model.rig)
 
 
 def _require_clear_outlet(rig: Rig, scene: Scene, near: Nearest, needed: float) -> None:
@@ -251,7 +250,19 @@ def _require_clear_outlet(rig: Rig, scene: Scene, near: Nearest, needed: float) 
     )
 
 
-def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig) -> BadInput:
+def _nearer_cables(scene: Scene) -> str:
+    """The step that lets cables be nearer to each other and to the platform."""
+    if scene.name == NO_SCENE:
+        return (
+            "pass a scene with a smaller clearance.self_mm: `cdpr jog --scene FILE`, in Python"
+            " scene="
+        )
+    return "reduce clearance.self_mm in the scene"
+
+
+def _clearance_error(
+    scene: Scene, name: str, near: Nearest, needed: float, key: str, rig: Rig
+) -> BadInput:
     distance, limit = near.distance * 1e3, needed * 1e3
     if near.distance <= 0.0:
         depth = f" (overlap {-distance:.1f} mm)" if distance < -0.05 else ""
@@ -264,7 +275,8 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
         )
     given = ", or --clearance-mm of `cdpr plan` and `cdpr jog`, in Python clearance=,"
     given = "" if key == "self_mm" else given
-    why = f"the scene's clearance.{key}{given} plus 0.05 mm that the planner keeps in reserve"
+    whose = "the default" if scene.name == NO_SCENE else "the scene's"
+    why = f"{whose} clearance.{key}{given} plus 0.05 mm that the planner keeps in reserve"
     next_step = f"move the {name} or the obstacle, or reduce the clearance"
     values: dict[str, float | str] = {
         "distance_mm": distance,
@@ -272,12 +284,12 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
         "pair": _pair(near),
     }
     if key == "self_mm":
-        reduced = ", or reduce clearance.self_mm in the scene" if near.distance > 0.0 else ""
+        reduced = f", or {_nearer_cables(scene)}" if near.distance > 0.0 else ""
         order = "if two outlets or anchors are interchanged, correct the rig file"
         next_step = f"move the {name}{reduced}; {order}"
         if near.second == PLATFORM:
             box = "correct the anchor or the platform's box in the rig file"
-            next_step = f"move the {name}, {box}, or reduce the clearance"
+            next_step = f"move the {name}, {box}, or {_nearer_cables(scene)}"
         elif shared := _shared_end(rig, near):
             end, exempt = shared
             why += (
@@ -285,8 +297,8 @@ def _clearance_error(name: str, near: Nearest, needed: float, key: str, rig: Rig
                 " quarter of the box's shortest side, may be nearer"
             )
             next_step = (
-                "declare a thicker platform box in the rig file, reduce clearance.self_mm in the"
-                f" scene, or move the {name}"
+                f"declare a thicker platform box in the rig file, move the {name}, or"
+                f" {_nearer_cables(scene)}"
             )
             values["exempt_mm"] = exempt * 1e3
     return BadInput(what, where=f"scene {name}", why=why, next_step=next_step, values=values)

@@ -23,7 +23,7 @@ from executor.interlock.interlock import MotionInterlock
 from executor.interlock.reference import HomingReference
 from executor.realtime.child import Armed, Ended, Records
 from executor.realtime.process import Mover
-from executor.recording.run_folder import EVENTS
+from executor.recording.run_folder import EVENTS, WINCHES
 from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import BadInput, CdprError, Fault
 from model.pose import Array, Pose
@@ -45,6 +45,7 @@ class WinchResult:
         began: Drive positions before it, shape (m,), [counts].
         counts: Drive positions at rest, shape (m,), [counts]; NaN if unknown.
         tensions: From the drive torques at rest, shape (m,), [N]; NaN if unknown.
+        folder: Of its record, as an absolute path; None without one.
     """
 
     state: State
@@ -52,6 +53,7 @@ class WinchResult:
     began: Array
     counts: Array
     tensions: Array
+    folder: Path | None = None
 
 
 AtRest = Callable[[WinchResult, Pose | None], HomingReference | None]
@@ -242,7 +244,6 @@ def _record_end(
 # survive a killed program, and a power cut except for about the last second.
 
 
-WINCHES = "winches.csv"
 FSYNC_EVERY = 1.0
 """Interval at which a thread forces both files to disk, [s]."""
 

@@ -36,7 +36,7 @@ from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import CableStatus, JogStatus, SessionStatus
 from executor.state_machine import REMARK, CycleRecord
 from executor.supervision import RequestBoard, Supervisor
-from executor.winch_runs import limit_of, move_supervised, supervised
+from executor.winch_runs import limit_of, move_supervised, record_folder, supervised
 from model.errors import truth_value
 from model.pose import Pose
 from model.progress import SILENT, Listener
@@ -290,7 +290,7 @@ def _run(
                 jogs.task,
                 jogs.make_drives,
                 jogs.status,
-                name,
+                record_folder(rig, None, name),
                 clock=clock,
                 need_real_time_rights=need_real_time_rights,
                 listener=listener,

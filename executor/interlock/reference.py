@@ -29,7 +29,10 @@ from model.rig import Rig, rig_from_document
 AGAIN = f"home the drives: {HOME}; nothing was moved"
 
 #: Besides, for absolute encoders.
-AS_IN_THE_FILE = "if they count as in the rig file, `cdpr home RIG --as-rig-file` instead"
+AS_IN_THE_FILE = (
+    "if they count as in the rig file, `cdpr home RIG --as-rig-file` instead, in Python"
+    " executor.use_rig_file_counts()"
+)
 
 #: Next step where encoders lost turns.
 OVER_THE_TRAVEL = f"make the encoders absolute over the whole travel, then {AGAIN}"

@@ -322,8 +322,12 @@ def ended_at_start(name: str, process: BaseProcess, consequence: str = "") -> Fa
     if (process.exitcode or 0) < 0:
         why, next_step = "it was killed, or the system ran out of memory", "start again"
     else:
-        why = "it imports the script that started it, which failed there as stated above"
-        next_step = 'save the script in a file, with its calls below `if __name__ == "__main__":`'
+        why = "it failed while it started; its error, if it printed one, is above"
+        next_step = (
+            "remove the cause: usually a script that is not saved in a file, or has calls outside"
+            ' `if __name__ == "__main__":`, or an interpreter or package that this user may not'
+            " read"
+        )
     return Fault(
         f"{name} ended before it was ready ({exit_text(process)}){consequence}",
         why=why,

@@ -41,6 +41,8 @@ PLAN, RIG, COURSE = "plan.json", "rig.json", "run.json"
 SUMMARY, EVENTS, POSES, POSES_OF = "summary.json", "events.jsonl", "poses.csv", "poses-{}.csv"
 CYCLES, CLEARANCE, FUSED = "cycles.csv", "clearance.csv", "fused.csv"
 MCAP, REPORT, PICTURES = "run.mcap", "report.html", "pictures"
+#: Of a motion of winches without a path, whose folder is no run folder.
+WINCHES = "winches.csv"
 #: Written before anything moves.
 BEGUN = (PLAN, RIG, COURSE, EVENTS)
 NEEDED = (*BEGUN, CYCLES, POSES, CLEARANCE, SUMMARY)
@@ -156,6 +158,10 @@ class RunFolder:
         why, then = "the run was interrupted", f"`cdpr report {quote(str(self.path))}` adds them"
         if self.is_active():
             what, why, then = "the run is still in progress", "", "wait, or see `cdpr monitor`"
+        elif os.path.isfile(self.path / WINCHES):
+            what = "the record of a motion of winches without a path, not of a run"
+            why = "homing and jogs of single cables have no plan, verdict or report"
+            then = f"read its {WINCHES}, such as by pandas.read_csv, and its {EVENTS}"
         elif self._missing(BEGUN):
             why += ", or this is another kind of folder"
             then = "give a folder that `cdpr run -o` created, or run the plan again"

@@ -20,6 +20,7 @@ ANSWER_TIMEOUT = 2.0
 #: Interval of searches for a run, [s].
 POLL_INTERVAL = 0.2
 _CHUNK = 65536
+_OVER = ("finished", "stopped", "latched")
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,11 +257,12 @@ class StopResult:
     silent: tuple[Answer, ...]
 
 
-def preparations(bus: str) -> list[dict[str, Any]]:
-    """Status of each motion on a bus that is still being prepared, and answers."""
+def motions_on(bus: str) -> dict[int, str]:
+    """State of the motion on a bus by its process, from the start of its preparation to its end."""
     with find_runs(ahead=True) as runs:
-        answers = ask_all([run for run in runs if run.is_ahead], "status")
-    return [answer.status for answer in answers if answer.status and answer.status["bus"] == bus]
+        found = [answer.status for answer in ask_all(runs, "status") if answer.status]
+    here = {one["process"]: one["state"] for one in found if one["bus"] == bus}
+    return {process: state for process, state in here.items() if state not in _OVER}
 
 
 def stop_runs() -> StopResult:

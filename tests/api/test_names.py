@@ -17,6 +17,7 @@ import pytest
 import cdpr
 from calibration.targets.boards import Charuco
 from calibration.targets.grids import CircleGrid
+from cdpr import operation
 from tests.cli.plans import write_short_plan
 
 ROOT = Path(__file__).parents[2]
@@ -55,6 +56,13 @@ def test_every_public_name_is_what_editors_see_under_it(package: str) -> None:
         assert getattr(module, name) is getattr(importlib.import_module(home), name), name
         assert name in dir(module)
         assert getattr(module, name).__doc__, name
+
+
+def test_every_function_for_scripts_is_a_public_name() -> None:
+    """Some are only in `cdpr.operation`, which had no list of them."""
+    own = {name: value for name, value in vars(operation).items() if inspect.isfunction(value)}
+    defined = {name for name, value in own.items() if value.__module__ == operation.__name__}
+    assert {name for name in defined if name[0] != "_"} == {*operation.__all__}
 
 
 def undescribed(name: str, value: Any) -> list[str]:

@@ -643,7 +643,8 @@ def calls_with_a_wrong_argument(name: str) -> Callable[[cdpr.Rig, cdpr.Scene, An
         *("locate_camera wanted", "locate_tags wanted", "track pictures", "track overlay"),
         *("measurement_poses " + name for name in ("tilt", "turn", "dwell")),
         *("home " + name for name in ("tension", "limit", "reach", "speed", "pictures")),
-        *("home simulated_slack", "home camera", "jog speed", "jog by"),
+        *("home simulated_slack", "home camera", "home folder", "jog_cable folder"),
+        *("jog speed", "jog by"),
         *("rig at", "rig clipped", "rig with_bus", "workspace_map characteristic_length"),
         *("jog_cable " + name for name in ("rig", "cable", "length", "limit", "speed")),
         *("tracker rig", "tracker camera", "observe image", "observe time", "observe by_drives"),
@@ -746,7 +747,10 @@ def test_messages_of_the_library_name_what_a_script_passes(rig: cdpr.Rig) -> Non
         cdpr.home(rig)
     with pytest.raises(cdpr.Refused, match=r"a jog of 60\.0 mm") as far:
         cdpr.jog(rig, None, by=[0.0, 0.0, 0.06])
+    with pytest.raises(cdpr.BadInput, match="no motion given") as unmoved:
+        cdpr.jog(rig, None)
     for caught, option, argument in (
+        (unmoved, "--help", "in Python pass by= or to_home=True, or use executor.jog_cable()"),
         (without, "--no-camera", "cameras=[]"),
         (unnamed, "--camera INDEX", "cameras=INDEX"),
         (virtual, "--interface", "rig.with_bus"),

@@ -11,6 +11,7 @@ import shutil
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from html import escape
 from pathlib import Path
 
@@ -24,7 +25,7 @@ import cdpr
 from cdpr.operation import set_speed
 from executor.drives import DriveStatus
 from executor.interlock.reference import ReferenceStatus
-from executor.jogging import CableJog
+from executor.jogging import CableJog, jog_cable
 from executor.recording.record_files import CameraRecord
 from executor.recording.run_folder import RunEvent, RunFolder
 from executor.remote.command_socket import find_runs
@@ -426,3 +427,28 @@ def test_homing_shows_its_facts() -> None:
     home = cdpr.home(ready()[0], at_home=True, realtime=False)
     assert repr(home).startswith("<HomeResult platform: ")
     assert home._repr_html_().count("<tr>") == len(home.facts())
+    assert home.folder is None
+
+
+def test_the_record_of_winches_is_found_and_is_not_taken_for_a_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its folder was not in the result, and was said to be an interrupted run."""
+    monkeypatch.chdir(tmp_path)
+    rig = ready()[0]
+    for move in (partial(jog_cable, rig, 1, -1e-5), partial(cdpr.home, rig, at_home=True)):
+        folder = tmp_path / move.func.__name__
+        result = move(folder=folder.name, realtime=False)
+        assert result.folder == folder
+        assert ("record", str(folder)) in result.facts()
+        header, *rows = (folder / "winches.csv").read_text().splitlines()
+        assert header.startswith("cycle,time_s,state,set_counts_1,")
+        assert rows
+        with pytest.raises(cdpr.BadInput, match="exists already"):
+            move(folder=folder, realtime=False)
+        for read in (cdpr.load_run, cdpr.report):
+            with pytest.raises(
+                cdpr.BadInput, match="a motion of winches without a path"
+            ) as refused:
+                read(folder)
+            assert "read its winches.csv" in refused.value.next_step

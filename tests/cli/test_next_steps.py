@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -30,6 +31,7 @@ from executor.interlock.reference import ReferenceStatus
 from executor.recording.run_folder import BEGUN, RunFolder
 from executor.remote.client import request_run as request
 from executor.remote.command_server import commands_from_start
+from executor.remote.status import identity
 from executor.run_result import RunResult
 from executor.safety.fault_messages import page_text
 from executor.service import StatusResult
@@ -224,6 +226,8 @@ def test_status_says_what_has_to_be_done_before_a_run() -> None:
     assert STANDING.next_step(rig) == ""
     lost = replace(STANDING, reference=replace(REFERENCED, counts=False, why_not="never homed"))
     assert lost.next_step(rig).startswith("cdpr home 'my rig.yaml'")
+    assert lost.next_step().startswith("cdpr home RIG with")
+    assert lost.next_step(rig).endswith("cdpr.home() with at_home=True, pose= or camera=")
     both = replace(lost, latched="cable 3 is slack").next_step(rig)
     assert both.index("cdpr reset 'my rig.yaml'") < both.index("cdpr home 'my rig.yaml'")
     assert replace(lost, run=17).next_step(rig) == ""
@@ -246,6 +250,27 @@ def test_status_names_who_prepares_a_motion_and_does_not_read_its_drives(
         assert (result.run, result.preparing, result.being_set_up) == (None, who, True)
         said = [text for name, text in result.facts(Path("rig.yaml")) if name == "motion"]
         assert said == [f"process {n} is preparing one; `cdpr stop` cancels it" for n in who]
+
+
+@pytest.mark.parametrize("state", ["preparing", "releasing", "enabling", "securing", "finished"])
+def test_a_motion_that_has_not_the_latch_yet_or_no_longer_is_named_and_its_drives_are_not_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: str
+) -> None:
+    """While its devices are opened, status read the drives, for which the run had to wait."""
+    for name in ("TMPDIR", "XDG_RUNTIME_DIR", "XDG_STATE_HOME"):
+        monkeypatch.setenv(name, str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    read: list[Rig] = []
+    monkeypatch.setattr(service, "_read", lambda rig, _, known: read.append(rig) or known)
+    rig = load_rig(CONFIGS / "gachon_8_6.yaml").with_bus("udp_multicast", "239.74.9.13")
+    moving: Any = SimpleNamespace(as_dict=lambda: {**identity(rig, None), "state": state})
+    started = commands_from_start("run", rig, Supervisor(), realtime=False)
+    with started as commands, commands.during_motion(moving):
+        result = service.status(rig)
+    here, is_ahead, is_over = os.getpid(), state == "preparing", state == "finished"
+    assert result.preparing == ((here,) if is_ahead else ())
+    assert result.run == (None if is_ahead or is_over else here)
+    assert len(read) == is_over, "its drives may be read once it is over"
 
 
 def test_status_names_no_reset_that_would_be_refused(

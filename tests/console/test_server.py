@@ -60,7 +60,7 @@ from executor.cameras.sources import SYNTHETIC, choose_cameras
 from executor.drives import is_simulated
 from executor.interlock.fault_latch import FaultLatch
 from executor.interlock.locks import SetUpLock
-from executor.remote.client import preparations, stop_runs
+from executor.remote.client import motions_on, stop_runs
 from executor.remote.command_server import commands_from_start
 from executor.remote.command_server import serving as commands
 from executor.remote.status import bus_name, identity
@@ -1002,7 +1002,7 @@ def test_a_motion_is_found_however_its_rig_file_spells_the_bus(tmp_path: Path, k
         (tmp_path / "by-id").symlink_to(tmp_path / "ttyACM1")
         there = here.with_bus(kind, str(tmp_path / "ttyACM1"))
     with commands_from_start("run", there, Supervisor(), realtime=False) as ahead:
-        assert [one["process"] for one in preparations(bus_name(here))] == [os.getpid()]
+        assert motions_on(bus_name(here)) == {os.getpid(): "preparing"}
         assert watch.why_busy() == "a motion is being prepared; wait, or stop it"
         moving: Any = SimpleNamespace(as_dict=lambda: {**identity(there, None), "state": "moving"})
         with ahead.during_motion(moving):

@@ -19,6 +19,7 @@ from executor import winch_runs
 from executor.realtime import child
 from executor.realtime import process as real_time_process
 from executor.realtime.child import CYCLE_SLOTS, Armed, Ended, Failed, Go, Job, ReadyDrives
+from executor.realtime.scheduling import ended_at_start
 from executor.realtime.shared_memory import CycleRecordCodec, Ring, SharedMemory, SharedRequests
 from executor.state_machine import CycleRecord, LoopEvent, State
 from model.errors import Fault, HardwareMissing
@@ -83,6 +84,17 @@ def test_a_process_killed_before_it_was_ready_moved_nothing(
         board.close()
     assert "out of memory" in caught.value.why
     assert "__main__" not in str(caught.value)
+
+
+@pytest.mark.parametrize("code", [1, 255])
+def test_a_process_that_could_not_start_is_not_said_to_have_imported_the_script(code: int) -> None:
+    """With 255 the interpreter itself could not start, as its files could not be read."""
+    ended: Any = SimpleNamespace(exitcode=code)
+    fault = ended_at_start("the real-time process", ended)
+    assert f"(exit code {code})" in fault.what
+    assert fault.why == "it failed while it started; its error, if it printed one, is above"
+    for cause in ('`if __name__ == "__main__":`', "an interpreter or package that this user may"):
+        assert cause in fault.next_step
 
 
 def end_of(

@@ -89,8 +89,10 @@ def test_the_next_step_without_one_names_the_ways_to_state_the_pose() -> None:
     with pytest.raises(Refused) as beyond:
         require_within_limits(rig, dict.fromkeys(range(8), 2**31 - 1), "unchanged")
     for caught in (unhomed, moved, beyond):
-        wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE"
-        assert wanted in caught.value.next_step
+        wanted = "`cdpr home RIG` with --at-home, --pose-mm X Y Z or --camera SOURCE, in Python"
+        assert f"{wanted} cdpr.home() with at_home=True, pose= or camera=;" in (
+            caught.value.next_step
+        )
 
 
 def test_a_reference_is_not_announced_as_discarded_where_none_will_be() -> None:
@@ -683,7 +685,8 @@ def test_a_loss_of_drives_never_homed_names_the_way_out_for_absolute_encoders() 
         interlock = MotionInterlock(rig_with(encoder))
         with pytest.raises(Refused, match="is lost") as refused:
             interlock.reference()
-        assert ("--as-rig-file" in refused.value.next_step) is (encoder == "absolute")
+        way = "`cdpr home RIG --as-rig-file` instead, in Python executor.use_rig_file_counts()"
+        assert (way in refused.value.next_step) is (encoder == "absolute")
     interlock.use_rig_file_counts()
     assert interlock.reference() is None
 

@@ -19,7 +19,7 @@ import pytest
 
 from executor.control.winch_motion import WinchResult, recording
 from executor.state_machine import CycleRecord, LoopEvent, State
-from executor.winch_runs import supervised
+from executor.winch_runs import record_folder, supervised
 from model.errors import BadInput, Fault, Refused
 from tests.configs import GACHON
 
@@ -136,6 +136,25 @@ def test_a_disk_that_hangs_holds_no_cycle_up(
         assert len((tmp_path / "home/winches.csv").read_text().splitlines()) == 501
         assert len(forced) <= 1, "none waits behind another"
         hangs.set()
+
+
+def test_only_drives_on_a_bus_leave_a_record_that_was_not_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    on_bus = GACHON.with_bus("socketcan", "can0")
+    assert record_folder(GACHON, None, "home") is None
+    names = record_folder(on_bus, None, "home")
+    assert names is not None
+    for wanted in ("runs/home", "runs/home-2"):
+        assert names() == Path(wanted)
+        names().mkdir(parents=True)
+    for rig in (GACHON, on_bus):
+        given = record_folder(rig, "mine", "home")
+        assert given is not None
+        assert given() == Path("mine")
+        with pytest.raises(BadInput, match="exists already"):
+            record_folder(rig, "runs/home", "home")
 
 
 def test_nothing_is_left_of_what_was_refused(tmp_path: Path) -> None:

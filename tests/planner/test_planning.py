@@ -344,6 +344,16 @@ def test_the_clearance_of_an_obstacle_is_named_as_every_verb_takes_it(gachon, sc
     assert "in Python clearance=," in refusal.value.why
 
 
+def test_without_a_scene_the_self_clearance_is_that_of_a_scene_to_pass(gachon) -> None:
+    """A jog with `scene=None` was told to reduce a clearance in the scene."""
+    wide = replace(gachon, cable_radius=0.006)
+    with pytest.raises(BadInput, match=r"at the start cable \d is .* mm from cable") as refusal:
+        require_usable_ends(wide, empty_scene(wide))
+    assert "the default clearance.self_mm plus" in refusal.value.why
+    assert "`cdpr jog --scene FILE`, in Python scene=" in refusal.value.next_step
+    assert "in the scene" not in str(refusal.value)
+
+
 def test_cables_too_near_each_other_get_no_advice_about_obstacles(gachon, scene_with) -> None:
     """Crossing cables may be moved apart; those from one anchor are near whatever the pose."""
     crossing = replace(scene_with(), self_clearance=0.017)
