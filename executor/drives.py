@@ -165,10 +165,9 @@ def _locked_bus(
         ready_to_simulate(listener)
         far_end = open_bus(settings)
         stack.callback(far_end.shutdown)
-        rehearsal = make_rehearsal(rig, far_end, simulated_start, load)
-        if lost_power is not None:
-            lost_power.apply_to(rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
-        yield _Drives(bus, rehearsal)
+        yield _Drives(
+            bus, make_rehearsal(rig, far_end, simulated_start, load, lost_power=lost_power)
+        )
 
 
 def read_snapshot(rig: Rig, simulated_start: Pose, load: Load) -> DriveSnapshot:

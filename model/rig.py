@@ -307,6 +307,18 @@ class Rig(ReadOnly):
         bus = document_of(dict(self.document.bus) | given, BusDocument, "Rig.with_bus")
         return rig_from_document(self.document.model_copy(update={"bus": bus}))
 
+    def with_tag_detector(self, detector: str) -> Rig:
+        """The same rig with the tag detector "opencv" or "apriltag", in memory only.
+
+        Raises:
+            BadInput: As for `with_bus`; an unknown detector is refused where tags are sought.
+        """
+        require_unaltered(self)
+        if (tags := self.document.tags) is None:
+            return self
+        tags = tags.model_copy(update={"detector": detector})
+        return rig_from_document(self.document.model_copy(update={"tags": tags}))
+
     def with_calibration(
         self, *results: CalibrationResult | FinishedCalibration, listener: Listener = SILENT
     ) -> Rig:
@@ -318,8 +330,7 @@ class Rig(ReadOnly):
                 result that is not good enough.
 
         Raises:
-            BadInput: A result does not fit this rig, two calibrate the same thing, or this rig is
-                an altered copy (`model.scene.require_unaltered`).
+            BadInput: A result does not fit, two calibrate the same thing, or as for `with_bus`.
         """
         require_unaltered(self)
         given = [one.result if isinstance(one, FinishedCalibration) else one for one in results]
@@ -372,8 +383,7 @@ def rig_from_document(document: RigDocument) -> Rig:
     if findings := [f"{key_path(parts)}: {what}" for parts, what in document.findings()]:
         raise BadInput("; ".join(findings), where=f"rig {document.name}")
     pulleys, tags = document.pulleys, document.tags
-    count = len(document.outlets_mm)
-    feed = pulleys.feed_directions if pulleys else [[0.0, 0.0, 1.0]] * count
+    feed = pulleys.feed_directions if pulleys else [[0.0, 0.0, 1.0]] * len(document.outlets_mm)
     return Rig(
         document=document,
         outlets=read_only(millimetres(document.outlets_mm)),

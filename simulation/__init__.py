@@ -8,17 +8,19 @@ from model.lazy import lazy_names
 
 if TYPE_CHECKING:
     from simulation.camera.camera import SyntheticCamera
-    from simulation.factory import make_rehearsal, make_synthetic_camera
-    from simulation.ground_truth import rig_as_built
+    from simulation.factory import make_rehearsal, make_synthetic_camera, open_rehearsal
+    from simulation.ground_truth import PowerLoss, rig_as_built
     from simulation.plant import Plant
     from simulation.rig import SimulatedRig
 
 __all__ = [
     "Plant",
+    "PowerLoss",
     "SimulatedRig",
     "SyntheticCamera",
     "make_rehearsal",
     "make_synthetic_camera",
+    "open_rehearsal",
     "rig_as_built",
 ]
 
@@ -27,8 +29,8 @@ if not TYPE_CHECKING:
         __name__,
         {
             "simulation.camera.camera": "SyntheticCamera",
-            "simulation.factory": "make_rehearsal make_synthetic_camera",
-            "simulation.ground_truth": "rig_as_built",
+            "simulation.factory": "make_rehearsal make_synthetic_camera open_rehearsal",
+            "simulation.ground_truth": "PowerLoss rig_as_built",
             "simulation.plant": "Plant",
             "simulation.rig": "SimulatedRig",
         },

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import can
 
-from model.errors import BadInput
+from drivers.can_bus import BusSettings, open_bus
+from drivers.factory import nodes_present
+from model.errors import BadInput, Refused
 from model.pose import Pose
 from model.rig import Camera, Rig
 from model.scene import Load, Scene
 from simulation.drives.behaviour import STRICT, DriveBehaviour
 from simulation.drives.eds_file import eds_of
-from simulation.ground_truth import camera_as_built, rig_as_built, simulation_of
+from simulation.ground_truth import PowerLoss, camera_as_built, rig_as_built, simulation_of
 from simulation.rig import SimulatedRig
 
 if TYPE_CHECKING:
@@ -26,6 +30,7 @@ def make_rehearsal(
     start_pose: Pose,
     load: Load | None = None,
     *,
+    lost_power: PowerLoss | None = None,
     behaviour: DriveBehaviour = STRICT,
     eds: Path | None = None,
 ) -> SimulatedRig[Any]:
@@ -36,20 +41,68 @@ def make_rehearsal(
         bus: The drives' end.
         start_pose: ``world_from_platform``.
         load: Payload of the platform.
+        lost_power: Effect of a power loss, applied at that pose.
         behaviour: Of CiA 402 drives, within the standards.
         eds: EDS file of CiA 402 drives (default: that of their profile).
 
     Raises:
         BadInput: The EDS file cannot be used, or the drives are not CiA 402 drives.
+        Fault: The platform has no equilibrium there.
     """
     check_drives(rig, behaviour, eds)
+    rehearsal: SimulatedRig[Any]
     if rig.document.drives.type == "odrive":
         from simulation.drives.odrive import SimulatedOdriveRig
 
-        return SimulatedOdriveRig(rig, bus, start_pose, load)
-    from simulation.drives.cia402_rig import SimulatedCia402Rig
+        rehearsal = SimulatedOdriveRig(rig, bus, start_pose, load)
+    else:
+        from simulation.drives.cia402_rig import SimulatedCia402Rig
 
-    return SimulatedCia402Rig(rig, bus, start_pose, load, behaviour=behaviour, eds=eds)
+        rehearsal = SimulatedCia402Rig(rig, bus, start_pose, load, behaviour=behaviour, eds=eds)
+    if lost_power is not None:
+        lost_power.apply_to(rig, rehearsal.plant, [drive.motor for drive in rehearsal.drives])
+    return rehearsal
+
+
+@contextmanager
+def open_rehearsal(
+    rig: Rig,
+    start_pose: Pose | None = None,
+    load: Load | None = None,
+    *,
+    lost_power: PowerLoss | None = None,
+    behaviour: DriveBehaviour = STRICT,
+    eds: Path | None = None,
+) -> Iterator[SimulatedRig[Any]]:
+    """Simulated drives on the rig's bus, closed at the end; `SimulatedRig.serve` runs them.
+
+    Args:
+        rig: The robot and its bus.
+        start_pose: ``world_from_platform`` (default: home).
+        load: This and the others as for `make_rehearsal`.
+
+    Raises:
+        BadInput: As for `make_rehearsal`, or python-can has no such interface.
+        HardwareMissing: The bus cannot be opened.
+        Refused: Drives with the same node ids already answer.
+        Fault: The bus failed, or the platform has no equilibrium.
+    """
+    bus = open_bus(settings := BusSettings.of(rig))
+    try:
+        if present := sorted(nodes_present(rig, bus)):
+            raise Refused(
+                f"drives with node ids {', '.join(map(str, present))} already answer",
+                where=str(settings),
+                why="two drives with the same node id answer each request twice",
+                next_step="end the other `cdpr sim`, disconnect the real drives, or pass another"
+                " `channel=`",
+            )
+        start = start_pose or rig.home
+        yield make_rehearsal(
+            rig, bus, start, load, lost_power=lost_power, behaviour=behaviour, eds=eds
+        )
+    finally:
+        bus.shutdown()
 
 
 def check_drives(rig: Rig, behaviour: DriveBehaviour = STRICT, eds: Path | None = None) -> None:

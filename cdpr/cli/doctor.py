@@ -100,23 +100,14 @@ def _show_table(found: Examined, rig: Rig) -> None:
     table = Table("")
     for title in ("object", "needed", "found", "meaning", "change"):
         table.add_column(title, overflow="fold")  # the last one names keys that the user types
-    marks = {"ok": "[green]ok[/]", "remark": "[yellow]remark[/]", "wrong": "[red]wrong[/]"}
-    for verdict in ("wrong", "remark", "ok"):
-        for row in found.rows:
-            if row.verdict == verdict:
-                text = row.found_text(found.nodes)
-                cells = (row.object, row.needed, text, row.meaning, row.change)
-                table.add_row(marks[verdict], *map(escape, cells))
+    marks = {"wrong": "[red]wrong[/]", "remark": "[yellow]remark[/]", "ok": "[green]ok[/]"}
+    for row in sorted(found.rows, key=lambda row: [*marks].index(row.verdict)):
+        cells = (row.object, row.needed, row.found_text(found.nodes), row.meaning, row.change)
+        table.add_row(marks[row.verdict], *map(escape, cells))
     if found.rows:
         out.print(table)
-    unexplained = [node for node in found.silent if node not in found.stopped]
-    for nodes, step in (
-        (found.stopped, "in NMT state 'stopped', by its heartbeat: run `cdpr reset RIG`"),
-        (unexplained, "check power, wiring and node id"),
-    ):
-        if nodes:
-            names = ", ".join(map(str, nodes))
-            out.print(f"[red]no answer[/] from drive {names}: {step}")
+    for nodes, step in found.silent_facts:
+        out.print(f"[red]no answer[/] from drive {', '.join(map(str, nodes))}: {step}")
     wrong = sum(row.verdict == "wrong" for row in found.rows)
     out.print(
         f"{len(found.rows)} objects of {len(found.nodes)} drives read, nothing written;"

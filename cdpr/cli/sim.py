@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import can
 import typer
 
 from cdpr.cli.arguments import flag, option
 from cdpr.cli.operate.supervision import stop_requests
 from cdpr.cli.options import CALIBRATION, CHANNEL, INTERFACE, RIG, Triple, level_pose, rig_on_bus
 from cdpr.cli.output import Terminal, out, show_line
-from drivers.can_bus import IN_PROCESS, BusSettings, open_bus
-from drivers.factory import nodes_present
+from drivers.can_bus import IN_PROCESS, BusSettings
 from executor.kernels import ready_to_simulate
 from executor.realtime.scheduling import real_time
 from executor.supervision import LocalRequests
-from model.errors import BadInput, Refused
+from model.errors import BadInput
 from model.plan import load_plan, require_same_rig
 from model.pose import Pose
 from model.rig import Rig
 from model.scene import Load
 from simulation.drives.behaviour import DriveBehaviour, behaviour_named, table
-from simulation.factory import check_drives, make_rehearsal
+from simulation.factory import check_drives, open_rehearsal
 from simulation.ground_truth import PowerLoss
 
 
@@ -80,42 +78,26 @@ def sim(
         )
     check_drives(the_rig, behaviour, eds)
     pose, load = _start(the_rig, start_mm, plan)
-    listener = Terminal()
+    lost_power = None
+    if power_lost is not None:
+        slack = 0.005 if slack_mm is None else slack_mm / 1000.0
+        lost_power = PowerLoss.drawn(the_rig, power_lost, slack, on_a_stand=on_a_stand)
+    listener, board = Terminal(), LocalRequests()
     ready_to_simulate(listener)
-    bus = open_bus(BusSettings.of(the_rig))
-    try:
-        _require_unoccupied(the_rig, bus)
-        rehearsal = make_rehearsal(the_rig, bus, pose, load, behaviour=behaviour, eds=eds)
-        if power_lost is not None:
-            slack = 0.005 if slack_mm is None else slack_mm / 1000.0
-            loss = PowerLoss.drawn(the_rig, power_lost, slack, on_a_stand=on_a_stand)
-            loss.apply_to(the_rig, rehearsal.plant, [d.motor for d in rehearsal.drives])
+    with open_rehearsal(
+        the_rig, pose, load, lost_power=lost_power, behaviour=behaviour, eds=eds
+    ) as rehearsal:
         x, y, z = rehearsal.pose.position * 1000.0
         show_line(
             f"{the_rig.cable_count} simulated drives of {the_rig.name} on"
             f" {BusSettings.of(the_rig)}; platform at {x:z.1f}, {y:z.1f}, {z:z.1f} mm;"
             " Ctrl-C ends the simulation"
         )
-        board = LocalRequests()
         with stop_requests(board), real_time() as denied:
             if denied:
                 listener.remark(denied)
             rehearsal.serve(lambda: board.read().stop)
-    finally:
-        bus.shutdown()
     out.print("simulation ended")
-
-
-def _require_unoccupied(rig: Rig, bus: can.BusABC) -> None:
-    present = sorted(nodes_present(rig, bus))
-    if present:
-        raise Refused(
-            f"drives with node ids {', '.join(map(str, present))} already answer",
-            where=str(BusSettings.of(rig)),
-            why="two drives with the same node id answer each request twice",
-            next_step="end the other `cdpr sim`, disconnect the real drives, or pass another"
-            " --channel",
-        )
 
 
 def _behaviour(names: list[str]) -> DriveBehaviour:
@@ -128,8 +110,8 @@ def _behaviour(names: list[str]) -> DriveBehaviour:
     return behaviour_named(names)
 
 
-def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose, Load | None]:
-    """The platform's initial pose, and its load."""
+def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose | None, Load | None]:
+    """The platform's initial pose (None: home), and its load."""
     if start_mm is not None and plan is not None:
         raise BadInput(
             "--at-mm and --plan contradict each other", next_step="leave out one of them"
@@ -139,4 +121,4 @@ def _start(rig: Rig, start_mm: Triple | None, plan: Path | None) -> tuple[Pose, 
         require_same_rig(the_plan, rig, plan)
         scene = the_plan.scene
         return scene.start, scene.load
-    return level_pose(start_mm) or rig.home, None
+    return level_pose(start_mm), None

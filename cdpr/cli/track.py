@@ -14,7 +14,7 @@ from executor.supervision import LocalRequests
 from executor.track import TrackResult, own_drawing, own_file, track_sources
 from model.files.output import refuse_overwriting, require_new_file
 from model.plan import load_plan, require_same_rig
-from model.rig import Camera, Rig, load_rig, rig_from_document
+from model.rig import Camera, load_rig
 from model.scene import load_scene
 
 
@@ -53,7 +53,7 @@ def track(
     """
     the_rig = calibrated_rig(load_rig(rig), calibration)
     if detector is not None:
-        the_rig = _with_detector(the_rig, detector)
+        the_rig = the_rig.with_tag_detector(detector)
     sources = parse_camera_sources(the_rig, source, camera)
     _require_outputs(sources, output, mcap, overlay, force)
     require_plan_used(sources.values(), plan)
@@ -84,15 +84,6 @@ def track(
     found = {"poses_file": str(output), **result.summary()}
     facts = [("poses file", str(output)), *result.facts()]
     present(as_json, {**found, "unused": result.unused_files()}, f"poses in {output}", facts)
-
-
-def _with_detector(rig: Rig, detector: str) -> Rig:
-    """The rig with another tag detector; a rig without tags is refused where they are sought."""
-    tags = rig.document.tags
-    if tags is None:
-        return rig
-    tags = tags.model_copy(update={"detector": detector})
-    return rig_from_document(rig.document.model_copy(update={"tags": tags}))
 
 
 def _require_outputs(

@@ -129,6 +129,14 @@ class Examined:
         watched = (row for row in self.rows if row.object[:5] in ("1006h", "1016h"))
         return all(row.verdict != "wrong" for row in watched)
 
+    @property
+    def silent_facts(self) -> list[tuple[tuple[int, ...], str]]:
+        """The silent drives in NMT *stopped*, then the others, each with the next step."""
+        unexplained = tuple(node for node in self.silent if node not in self.stopped)
+        stopped = "in NMT state 'stopped', by its heartbeat: run `cdpr reset RIG`"
+        facts = [(self.stopped, stopped), (unexplained, "check power, wiring and node id")]
+        return [(nodes, step) for nodes, step in facts if nodes]
+
     def as_dict(self) -> dict[str, Any]:
         """For `--json`."""
         return {

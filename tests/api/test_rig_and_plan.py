@@ -185,6 +185,7 @@ def test_a_copy_with_other_values_is_refused_with_how_to_make_one(
             lambda: cdpr.locate_camera(other, "absent"),
             lambda: cdpr.locate_tags(other, "absent"),
             lambda: other.with_bus("virtual", "other"),
+            lambda: other.with_tag_detector("apriltag"),
             lambda: other.with_calibration(),
         ]
         step = "cdpr.Rig.from_dict({**rig.as_dict(), ...}), rig.with_bus or rig.with_calibration"

@@ -739,6 +739,9 @@ def test_doctor_names_silent_drives_and_reads_the_others(rig: Rig) -> None:
     found = examined(rig, bus)
     assert (found.silent, len(found.nodes), found.good) == ((2,), 7, False)
     assert found.stopped == ()
+    assert found.silent_facts == [((2,), "check power, wiring and node id")]
+    stopped, unpowered = replace(found, silent=(2, 5), stopped=(5,)).silent_facts
+    assert (stopped[0], "cdpr reset" in stopped[1], unpowered[0]) == ((5,), True, (2,))
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from itertools import pairwise
 from pathlib import Path
+from unittest import mock
 
 import can
 import numpy as np
@@ -15,6 +16,7 @@ from drivers.cia402.profile import load_profile
 from drivers.cia402.state_machine import DriveState
 from model.errors import BadInput
 from model.rig import Rig
+from simulation import factory
 from simulation.drives.behaviour import BEHAVIOURS, STRICT, behaviour_named, table
 from simulation.drives.cia402_rig import SimulatedCia402Rig
 from simulation.drives.eds_file import profile_path, read_eds
@@ -467,6 +469,19 @@ def test_the_command_line_takes_no_eds_for_odrives() -> None:
     wrong = call("sim", odrives, "--interface", "udp_multicast", "--drive-behaviour", "sdo-twice")
     assert wrong.code == 2
     assert "ODrive" in wrong.err
+
+
+def test_drives_that_answer_already_are_not_simulated_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    file = Path(__file__).parents[2] / "configs" / "gachon_8_6.yaml"
+    bus = open_bus(BusSettings("virtual", "occupied"))
+    monkeypatch.setattr(factory, "open_bus", lambda _settings: bus)
+    monkeypatch.setattr(factory, "nodes_present", lambda _rig, _bus: {4, 2})
+    with mock.patch.object(bus, "shutdown", wraps=bus.shutdown) as closed:
+        answer = call("sim", file, "--interface", "udp_multicast")
+    assert answer.code == 3
+    assert "drives with node ids 2, 4 already answer" in answer.said
+    assert "disconnect the real drives, or pass another --channel" in answer.said
+    closed.assert_called_once()
 
 
 def test_a_wrong_eds_file_is_found_before_the_bus_is_opened(tmp_path: Path) -> None:
