@@ -34,7 +34,7 @@ from calibration.geometry.identifiability import identified, uncertainty_of_rig
 from calibration.geometry.parameters import DEFAULT_DEVIATIONS, Parameters
 from calibration.geometry.quality import judge_rig
 from calibration.result_files import load_result
-from model.kinematics import poses_near
+from model.kinematics import settled_poses_near
 from model.rig import Rig, load_rig
 from model.winches import WinchMap
 from tests.calibration.rig_places import (
@@ -87,7 +87,7 @@ def position_error(rig: Rig, truth: Truth) -> float:
     """Error of the platform position by forward kinematics of a rig, RMS, [mm]."""
     winches, data = WinchMap(rig), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    found, _, _ = poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)
+    found, _ = settled_poses_near(rig, lengths, truth.positions, truth.rotations)
     squares = np.sum((found - truth.positions) ** 2, axis=1)
     return float(np.sqrt(np.mean(squares))) * 1e3
 

@@ -245,23 +245,24 @@ def _settled_from(rig: Rig, lengths: Array, starts: Sequence[Pose]) -> list[Pose
 
 
 def poses_near(
-    rig: Rig, lengths: Array, positions: Array, rotations: Array, *, steps: int = 4
+    rig: Rig, lengths: Array, positions: Array, rotations: Array
 ) -> tuple[Array, Array, Array]:
     """Forward kinematics of many poses at once, each near a known one (Gauss–Newton).
+
+    Each step squares an error of millimetres, so four reach round-off.
 
     Args:
         rig: The robot, with point exits or pulleys.
         lengths: Shape (n, m), [m].
         positions: Guesses, world frame, shape (n, 3), [m].
         rotations: Guesses, ``world_from_platform``, shape (n, 3, 3).
-        steps: Gauss–Newton steps; each squares an error of millimetres, so four reach round-off.
 
     Returns:
         Positions, shape (n, 3), [m]; rotations, shape (n, 3, 3); and for each pose the largest
         absolute residual of a cable before the last step, shape (n,), [m].
     """
     scale, residuals = step_scale(rig), np.zeros_like(lengths)
-    for _ in range(steps):
+    for _ in range(4):
         anchors = positions[:, None, :] + np.einsum("nij,mj->nmi", rotations, rig.anchors)
         cables = cables_to(rig, anchors)
         matrices = structure_matrix_of(cables, positions) * scale[:, None]

@@ -284,11 +284,9 @@ PlannerName = Literal["optimal", "adaptive", "goal-bias"]
 Objective = Literal["length", "kinematic", "clearance", "capacity"]
 """Named objectives."""
 
-_OPTIMAL = ("weight", "budget_ms", "rounds", "longest_mm", "free_rotation")
+_OPTIMAL = ("weights", "budget", "rounds", "longest", "free_rotation")
 _PAPER = ("mode", "max_iterations")
 _OPTIONS = {"optimal": _OPTIMAL, "adaptive": _PAPER, "goal-bias": _PAPER}
-_ARGUMENTS = {"weight": "weights", "budget_ms": "budget", "longest_mm": "longest"}
-"""Arguments of `cdpr.plan` with another name than the option."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -299,10 +297,10 @@ class PlanningOptions:
         planner: Which planner searches.
         seed: Of the random numbers.
         cost: Objective; when left out ``length``, or ``kinematic`` for the paper's planners.
-        weight: Weights of a sum of objectives, by name.
-        budget_ms: Optimal: time to find and improve a path.
+        weights: Weights of a sum of objectives, by name.
+        budget: Optimal: time to find and improve a path, [s].
         rounds: Optimal: rounds instead of the budget, one number or one per leg; reproducible.
-        longest_mm: Optimal: length limit of the path.
+        longest: Optimal: length limit of the path, [m].
         free_rotation: Optimal: the platform may rotate, within the scene's limits.
         mode: The paper's planners: RRT* (rewire), or stop at the first path (paper).
         max_iterations: The paper's planners: give up after this number of samples.
@@ -311,10 +309,10 @@ class PlanningOptions:
     planner: PlannerName = "optimal"
     seed: int = 0
     cost: Objective | None = None
-    weight: Mapping[str, float] = field(default_factory=dict)
-    budget_ms: float | None = None
+    weights: Mapping[str, float] = field(default_factory=dict)
+    budget: float | None = None
     rounds: Sequence[int] = ()
-    longest_mm: float | None = None
+    longest: float | None = None
     free_rotation: bool = False
     mode: Mode | None = None
     max_iterations: int | None = None
@@ -333,8 +331,8 @@ def settings_from_options(options: PlanningOptions) -> Settings:
         value = getattr(options, name)
         if not isinstance(value, str | None):
             raise BadInput(f"the {name} must be text, it is {value!r}")
-    if not isinstance(options.weight, Mapping):
-        what = f"the weights must be a mapping such as {{'length': 1.0}}, not {options.weight!r}"
+    if not isinstance(options.weights, Mapping):
+        what = f"the weights must be a mapping such as {{'length': 1.0}}, not {options.weights!r}"
         raise BadInput(what)
     if options.planner not in _OPTIONS:
         raise BadInput(
@@ -350,7 +348,7 @@ def _refuse_unused(options: PlanningOptions) -> None:
     others = {*_OPTIMAL, *_PAPER} - {*_OPTIONS[options.planner]}
     unused = [name for name in sorted(others) if _is_given(getattr(options, name))]
     if unused:
-        named = ", ".join(f"`{_ARGUMENTS.get(name, name)}=`" for name in unused)
+        named = ", ".join(f"`{name}=`" for name in unused)
         raise BadInput(
             f"`planner={options.planner!r}` does not take {named}",
             next_step="leave it out, or choose another planner",
@@ -364,21 +362,21 @@ def _is_given(value: object) -> bool:
 
 
 def _optimal_settings(options: PlanningOptions) -> OptimalSettings | TurningSettings:
-    if options.weight and options.cost is not None:
+    if options.weights and options.cost is not None:
         raise BadInput(
             "`cost=` and `weights=` contradict each other", next_step="leave out one of them"
         )
-    if options.budget_ms is not None and options.rounds:
+    if options.budget is not None and options.rounds:
         raise BadInput(
             "`budget=` and `rounds=` contradict each other", next_step="leave out one of them"
         )
-    budget = options.budget_ms
-    given: dict[str, Any] = {} if budget is None else {"budget": budget / 1000.0}
+    budget = options.budget
+    given: dict[str, Any] = {} if budget is None else {"budget": budget}
     cost = "length" if options.cost is None else options.cost
     _require_objective(cost)
     return (TurningSettings if options.free_rotation else OptimalSettings)(
-        weights=_weights(options.weight) if options.weight else OBJECTIVES[cost],
-        longest=math.inf if options.longest_mm is None else options.longest_mm / 1000.0,
+        weights=_weights(options.weights) if options.weights else OBJECTIVES[cost],
+        longest=math.inf if options.longest is None else options.longest,
         seed=options.seed,
         rounds=options.rounds[0] if options.rounds else None,
         **given,

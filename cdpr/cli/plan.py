@@ -71,9 +71,11 @@ class SearchOptions:
     )
 
     def with_seed(self, seed: int) -> PlanningOptions:
-        """As options of the planner's library."""
+        """As options of the planner's library, in SI."""
         given: dict[str, Any] = {one.name: getattr(self, one.name) for one in fields(self)}
-        given["weight"] = _weights(self.weight or [])
+        weights, budget, longest = map(given.pop, ("weight", "budget_ms", "longest_mm"))
+        given["weights"] = _weights(weights or [])
+        given["budget"], given["longest"] = budget and budget / 1e3, longest and longest / 1e3
         return PlanningOptions(seed=seed, **{k: v for k, v in given.items() if v is not None})
 
 

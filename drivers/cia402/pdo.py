@@ -102,9 +102,9 @@ def make_nmt(command: NmtCommand, node: int) -> bytes:
     return bytes((command, node))
 
 
-def make_emergency(code: int, register: int, detail: bytes = b"") -> bytes:
-    """EMCY message; ``detail`` is padded to five bytes."""
-    return _EMCY.pack(code, register, detail)
+def make_emergency(code: int, register: int) -> bytes:
+    """EMCY message, its manufacturer-specific bytes zero."""
+    return _EMCY.pack(code, register, b"")
 
 
 def parse_emergency(data: bytes | bytearray) -> Emergency | None:

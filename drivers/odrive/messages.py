@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -123,8 +123,7 @@ def read_layouts(file: Path | str | None = None) -> Layouts:
     """
     path = Path(file or OWN_DBC)
     database = _database(path)
-    found = {name.lower(): _layout(database, name, path) for name in NEEDED}
-    return Layouts(**{field.name: found[field.name] for field in fields(Layouts)})
+    return Layouts(**{name.lower(): _layout(database, name, path) for name in NEEDED})
 
 
 def _database(path: Path) -> Any:

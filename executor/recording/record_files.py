@@ -46,13 +46,11 @@ def _is_moment(text: str) -> str:
 
 
 class _Record(BaseModel):
-    model_config = ConfigDict(extra="allow", strict=True, frozen=True)
-
-
-class EventRecord(BaseModel):
-    """One line of ``events.jsonl``."""
-
     model_config = ConfigDict(extra="ignore", strict=True, frozen=True)
+
+
+class EventRecord(_Record):
+    """One line of ``events.jsonl``."""
 
     time_s: Number
     code: str
@@ -316,7 +314,6 @@ class CameraRecord:
 
 #: Initial size of the file, [bytes], so that the end of the run fits on a full disk.
 SIZE = 8192
-_CAMERA_KEYS = set(CameraRecordDocument.model_fields)
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,9 +355,7 @@ class RunCourse:
         kept, _ = read_record(path, CourseDocument)
         values = {one.name: getattr(kept, one.name) for one in fields(cls)}
         values["started"] = datetime.fromisoformat(kept.started)
-        values["cameras"] = tuple(
-            CameraRecord(**one.model_dump(include=_CAMERA_KEYS)) for one in kept.cameras
-        )
+        values["cameras"] = tuple(CameraRecord(**dict(one)) for one in kept.cameras)
         return cls(**values | {"troubles": tuple(kept.troubles)})
 
     def save(self, path: Path) -> None:

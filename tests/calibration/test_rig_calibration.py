@@ -52,7 +52,7 @@ from calibration.geometry.result import RigResult, require_same_nominal, rig_res
 from calibration.result_files import load_result
 from model.errors import BadInput, InvalidFile
 from model.files.rig_file import RigDocument
-from model.kinematics import poses_near
+from model.kinematics import settled_poses_near
 from model.pose import Array, Pose, matrix_from_rotation_vector, moved, rotation_vector_from_matrix
 from model.rig import Rig, load_rig, rig_from_document
 from model.statics.gravity import working_tensions
@@ -101,7 +101,7 @@ def positions_by(rig: Rig, truth: Truth) -> Array:
     """Platform positions by forward kinematics of a rig with its own winches, (n, 3), [m]."""
     winches, data = WinchMap(rig), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    return poses_near(rig, lengths, truth.positions, truth.rotations, steps=20)[0]
+    return settled_poses_near(rig, lengths, truth.positions, truth.rotations)[0]
 
 
 def errors_of(rig: Rig, truth: Truth) -> Array:

@@ -15,7 +15,7 @@ from calibration.geometry.result import require_physical
 from calibration.result_files import load_result
 from cdpr.cli.calibrate import rig as rig_verb
 from model.errors import Fault
-from model.kinematics import poses_near
+from model.kinematics import settled_poses_near
 from model.rig import Rig, load_rig
 from model.winches import WinchMap
 from tests.calibration.rig_places import samples, write_samples
@@ -109,7 +109,7 @@ def test_the_recorded_session_calibrates_its_rig_to_a_tenth_of_a_millimetre(
     truth = samples(rig, 20, tilt=0.05, seed=8, noise=0.0)
     winches, data = WinchMap(corrected), truth.measured
     lengths = winches.strained(winches.unstrained_from_counts(data.counts), data.tensions)
-    found, _, _ = poses_near(corrected, lengths, truth.positions, truth.rotations, steps=10)
+    found, _ = settled_poses_near(corrected, lengths, truth.positions, truth.rotations)
     assert np.linalg.norm(found - truth.positions, axis=1).max() < 0.2e-3
     motion = ("--by-mm", "0", "0", "2", "--no-scene", "--fast", "-o", tmp_path / "jog")
     jogged = call("jog", RIG, *motion, "--calibration", result, "--json")

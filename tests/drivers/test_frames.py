@@ -72,7 +72,6 @@ def test_network_commands_and_states_are_those_of_the_standard() -> None:
 def test_an_emergency_is_read_as_the_standard_lays_it_out() -> None:
     read = parse_emergency(bytes.fromhex("1186010a0b0c0d0e"))
     assert read == (0x8611, 0x01, bytes.fromhex("0a0b0c0d0e"))
-    assert make_emergency(0x8611, 1, b"\x0a\x0b").hex() == "1186010a0b000000"
 
 
 @pytest.mark.parametrize(("byte", "state"), [(0x7F, 0x7F), (0xFF, 0x7F), (0x04, 4), (0x80, 0)])
