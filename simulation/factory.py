@@ -79,7 +79,10 @@ def open_rehearsal(
     Args:
         rig: The robot and its bus.
         start_pose: ``world_from_platform`` (default: home).
-        load: This and the others as for `make_rehearsal`.
+        load: Payload of the platform.
+        lost_power: Effect of a power loss, applied at that pose.
+        behaviour: Of CiA 402 drives, within the standards.
+        eds: EDS file of CiA 402 drives (default: that of their profile).
 
     Raises:
         BadInput: As for `make_rehearsal`, or python-can has no such interface.
