@@ -208,9 +208,10 @@ def status(rig: Rig) -> StatusResult:
     latched, run = latch.read_in_motion()
     refusal = latch.why_not_reset(rig.name, latched) if latched else None
     motions = motions_on(bus_name(rig))  # also armed without the latch yet, or no longer with it
-    moving = [process for process, state in motions.items() if state != "preparing"]
-    run = next(iter(moving), None) if run is None else run
-    preparing = tuple(process for process in motions if process not in (run, *moving))
+    if run is None:
+        run = next((process for process, state in motions.items() if state != "preparing"), None)
+    ahead = (process for process, state in motions.items() if state == "preparing")
+    preparing = tuple(process for process in ahead if process != run)
     known = StatusResult(
         rig=rig.name,
         bus=str(settings),

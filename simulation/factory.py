@@ -90,8 +90,8 @@ def open_rehearsal(
         Refused: Drives with the same node ids already answer.
         Fault: The bus failed, or the platform has no equilibrium.
     """
-    bus = open_bus(settings := BusSettings.of(rig))
-    try:
+    settings = BusSettings.of(rig)
+    with open_bus(settings) as bus:
         if present := sorted(nodes_present(rig, bus)):
             raise Refused(
                 f"drives with node ids {', '.join(map(str, present))} already answer",
@@ -104,8 +104,6 @@ def open_rehearsal(
         yield make_rehearsal(
             rig, bus, start, load, lost_power=lost_power, behaviour=behaviour, eds=eds
         )
-    finally:
-        bus.shutdown()
 
 
 def check_drives(rig: Rig, behaviour: DriveBehaviour = STRICT, eds: Path | None = None) -> None:

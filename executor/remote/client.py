@@ -12,6 +12,7 @@ from typing import Any
 
 from executor.remote.command_socket import RunConnection, find_runs, record_stop
 from executor.remote.protocol import make_line
+from executor.state_machine import State
 from model.errors import BadInput, Fault
 from tracking.measurement import rates
 
@@ -20,7 +21,7 @@ ANSWER_TIMEOUT = 2.0
 #: Interval of searches for a run, [s].
 POLL_INTERVAL = 0.2
 _CHUNK = 65536
-_OVER = ("finished", "stopped", "latched")
+_OVER = {state.value for state in (State.FINISHED, State.STOPPED, State.LATCHED)}
 
 
 @dataclass(frozen=True, slots=True)

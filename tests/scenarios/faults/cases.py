@@ -26,6 +26,7 @@ from tests.drivers.drive_bench import make_reply
 from tests.scenarios.faults.bench import EVERY_ID, Bench, Script, SimulatedBench, a_message, once
 from tests.scenarios.faults.fault_bus import BUS_OFF, delay, lose, lose_next, repeat, spoil
 from tests.scenarios.faults.samples import emergencies, left_holding
+from tests.scenarios.stage import CRUISING
 
 NODES = range(1, 9)
 REPLIES = frozenset(TPDO1_BASE + node for node in NODES)
@@ -123,6 +124,22 @@ def incoming(rule: Callable[[], object]) -> Callable[[], Script]:
 def outgoing(rule: Callable[[], object]) -> Callable[[], Script]:
     """Frames from the drives."""
     return then(lambda bench: bench.line.outgoing.append(rule()))  # type: ignore[arg-type]
+
+
+def far_on(make: Callable[[], Script]) -> Callable[[], Script]:
+    """Later than usual, unless another cycle was chosen: near the start a sign matters little."""
+
+    def made() -> Script:
+        script = make()
+
+        def delayed(bench: Bench) -> None:
+            if bench.fault_cycle == CRUISING:
+                bench.fault_cycle = 150
+            script(bench)
+
+        return delayed
+
+    return made
 
 
 def replies_held_up(bench: Bench) -> None:
@@ -355,7 +372,7 @@ TABLE: dict[str, Fault] = {
         outgoing(lambda: spoil(REPLY_4, shifted(99999), 2)), words=("drive 4", "jumped")
     ),
     "F12 sign flipped": Fault(
-        outgoing(lambda: spoil(REPLY_4, mirrored)), words=("cable 4", "from its set-point")
+        far_on(outgoing(lambda: spoil(REPLY_4, mirrored))), words=("drive 4", "jumped")
     ),
     "F12 a frozen position": Fault(
         outgoing(lambda: spoil(REPLY_4, frozen())), words=("(drive 4) did not move",)

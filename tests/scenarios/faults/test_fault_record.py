@@ -16,7 +16,7 @@ from executor.trajectory.setpoints import PreparedRun
 from tests.scenarios.faults.bench import Script, once, simulated
 from tests.scenarios.faults.cases import TABLE, incoming, late
 from tests.scenarios.faults.fault_bus import lose_next
-from tests.scenarios.stage import concluded
+from tests.scenarios.stage import CRUISING, concluded
 from tests.scenarios.test_faults import jump_in_table
 
 #: Distance of drives at rest from their last set-points, [counts].
@@ -59,7 +59,7 @@ def test_row_and_travel_are_those_last_sent(
     table, rows = prepared.checked.table, cycles.path_index
     stopped = np.array(cycles.state) == State.LATCHED.value
     assert stopped.sum() > 5
-    assert 60 < rows[-1] < len(table) - 1
+    assert CRUISING - 20 < rows[-1] < len(table) - 1
     assert (cycles.set_counts[stopped] == table.setpoints[rows[stopped]]).all()
     assert np.abs(cycles.actual_counts - cycles.set_counts)[stopped].max() <= FOLLOWED
     assert summary["travelled_mm"] == pytest.approx(table.travelled[rows[-1]] * 1e3, abs=1e-6)
