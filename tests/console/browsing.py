@@ -228,24 +228,45 @@ class Visit:
         expect(self.page.locator("#cable-state")).to_contain_text("Ready")
 
     def hold(self, name: str = "+x") -> int:
-        """Presses a jog button by mouse; the number of the press.
-
-        A busy computer may hold the page up for so long that it ends the press itself, as it must:
-        such a press is forgotten, and it is pressed again.
-        """
+        """Presses a jog button by mouse; the number of the press."""
         self.move_to(f'[data-jog="{name}"]')
+        mouse = self.page.mouse
+        return int(self.press(mouse.down, mouse.up)["hold"])
+
+    def hold_key(self, pad: str, key: str) -> dict[str, Any]:
+        """Presses a key on a pad that is given the focus; a message of the press."""
+
+        def down() -> None:
+            self.page.locator(pad).focus()
+            self.page.keyboard.down(key)
+
+        return self.press(down, lambda: self.page.keyboard.up(key))
+
+    def press(self, down: Callable[[], Any], up: Callable[[], Any]) -> dict[str, Any]:
+        """Calls ``down``; a message of the press that it begins.
+
+        A busy computer may hold the page up for so long that it refuses the press or ends it
+        itself, as it must: such a press is forgotten, and after ``up`` it is pressed again.
+        """
         for _ in range(5):
-            before = self.fake.ask()["received"]
-            self.page.mouse.down()
-            at = len(before) + 2
-            found = self.fake.wait(self.page, lambda f, at=at: len(f["received"]) >= at)  # type: ignore[misc]
-            said = found["received"][len(before) :]
-            if all(message["kind"] == "held" for message in said):
-                return int(said[-1]["hold"])
-            self.page.mouse.up()
-            self.fake.let_pass(self.page, 2)
-            self.fake.ask(set={"received": before})
+            first = self.fake.ask()
+            down()
+            found = self.fake.wait(self.page, lambda f, first=first: _pressed(f, first))  # type: ignore[misc]
+            said = found["received"][len(first["received"]) :]
+            if said and all(message["kind"] == "held" for message in said):
+                one = said[-1]
+                assert isinstance(one, dict)
+                return one
+            up()
+            self.fake.let_pass(self.page, 4)
+            self.fake.ask(set={"received": first["received"]})
         raise AssertionError("the page is held up again and again")
+
+
+def _pressed(found: dict[str, Any], before: dict[str, Any]) -> bool:
+    """Whether two messages came since ``before``, or none for so long that none will."""
+    more = len(found["received"]) - len(before["received"])
+    return more >= 2 or found["ticks"] >= before["ticks"] + 40
 
 
 def _count(found: dict[str, Any], kind: str) -> int:

@@ -9,7 +9,14 @@ import pytest
 from playwright.sync_api import Browser, expect
 
 from tests.console.browsing import SIZES, Fake, Visit, visit
-from tests.console.test_page_jog import ENDS, GAMEPAD, LASTING, end_one_after_another, ends_for_good
+from tests.console.test_page_jog import (
+    ENDS,
+    GAMEPAD,
+    LASTING,
+    deflection,
+    end_one_after_another,
+    ends_for_good,
+)
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -80,11 +87,9 @@ def test_what_it_means_for_the_reference_is_said_before(desk: Visit, homed: bool
 
 def test_keys_wind_in_and_pay_out_while_the_pad_has_the_focus(desk: Visit) -> None:
     desk.ready_to_jog_cables()
-    desk.page.locator("#cable-pad").focus()
     for key, sense in (("ArrowUp", "wind_in"), ("PageDown", "pay_out")):
-        desk.page.keyboard.down(key)
-        found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
-        assert (found["received"][-1]["cable"], found["received"][-1]["sense"]) == (1, sense)
+        found = desk.hold_key("#cable-pad", key)
+        assert (found["cable"], found["sense"]) == (1, sense)
         desk.page.keyboard.up(key)
         desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
 
@@ -92,9 +97,7 @@ def test_keys_wind_in_and_pay_out_while_the_pad_has_the_focus(desk: Visit) -> No
 def test_a_key_that_is_held_ends_with_a_finger_and_begins_nothing(desk: Visit) -> None:
     """The second control ends the press of the first and does not begin its own."""
     desk.ready_to_jog_cables()
-    desk.page.locator("#cable-pad").focus()
-    desk.page.keyboard.down("ArrowUp")
-    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
+    desk.hold_key("#cable-pad", "ArrowUp")
     desk.page.locator('[data-jog="pay_out"]').hover()
     desk.page.mouse.down()
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
@@ -114,9 +117,7 @@ def test_a_stick_winds_in_and_pays_out_and_ends_when_it_changes_direction(
     desk.page.locator("#cable-gamepad").check()
     desk.page.evaluate("() => { fakePad.buttons[4].pressed = true; }")
     desk.fake.let_pass(desk.page, 4)
-    desk.page.evaluate("(axes) => { fakePad.axes = axes; }", axes)
-    found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")["received"][-1]
-    assert found["sense"] == sense
+    assert desk.press(*deflection(desk, axes))["sense"] == sense
     desk.page.evaluate("(axes) => { fakePad.axes = axes.map((v) => -v); }", axes)
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
     assert desk.fake.let_pass(desk.page)["received"][-1]["kind"] == "let_go", (

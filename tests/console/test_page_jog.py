@@ -173,19 +173,14 @@ def test_keys_jog_only_while_the_pad_has_the_focus(desk: Visit) -> None:
     desk.page.locator("#scene-in").focus()
     desk.page.keyboard.press("PageUp")
     assert [m for m in desk.fake.let_pass(desk.page)["received"] if m["kind"] == "held"] == []
-    desk.page.locator("#jog-pad").focus()
-    desk.page.keyboard.down("PageUp")
-    found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
-    assert found["received"][-1]["direction"] == [0, 0, 1]
+    assert desk.hold_key("#jog-pad", "PageUp")["direction"] == [0, 0, 1]
     desk.page.keyboard.up("PageUp")
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
 
 
 def test_a_key_ends_when_the_focus_goes(desk: Visit) -> None:
     desk.ready_to_jog()
-    desk.page.locator("#jog-pad").focus()
-    desk.page.keyboard.down("ArrowLeft")
-    desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")
+    desk.hold_key("#jog-pad", "ArrowLeft")
     desk.page.locator("#jog-speed").focus()
     desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "let_go")
     desk.page.keyboard.up("ArrowLeft")
@@ -196,9 +191,12 @@ def test_the_second_of_two_fingers_begins_nothing(phone: Visit) -> None:
     phone.ready_to_jog()
     press = """([name, id]) => document.querySelector(`[data-jog="${name}"]`).dispatchEvent(
       new PointerEvent("pointerdown", { pointerId: id, bubbles: true, button: 0, buttons: 1 }))"""
+    lift = """id => window.dispatchEvent(new PointerEvent("pointerup", { pointerId: id }))"""
     phone.page.evaluate("() => { Element.prototype.setPointerCapture = () => {}; }")
-    phone.page.evaluate(press, ["+x", 11])
-    phone.fake.wait(phone.page, lambda f: f["received"][-1]["kind"] == "held")
+    phone.press(
+        lambda: phone.page.evaluate(press, ["+x", 11]),
+        lambda: phone.page.evaluate(lift, 11),
+    )
     phone.page.evaluate(press, ["+y", 12])
     phone.fake.wait(phone.page, lambda f: f["received"][-1]["kind"] == "let_go")
     assert phone.fake.let_pass(phone.page)["received"][-1]["kind"] == "let_go"
@@ -209,6 +207,15 @@ GAMEPAD = """() => {
   window.fakePad = { connected: true, mapping: "standard", axes: [0, 0, 0, 0], buttons };
   navigator.getGamepads = () => [window.fakePad];
 }"""
+
+
+def deflection(found: Visit, axes: list[float]) -> tuple[Callable[[], Any], Callable[[], Any]]:
+    """Deflects the gamepad's sticks, and lets go of them."""
+    script = "(axes) => { fakePad.axes = axes; }"
+    return (
+        lambda: found.page.evaluate(script, axes),
+        lambda: found.page.evaluate(script, [0, 0, 0, 0]),
+    )
 
 
 @pytest.mark.parametrize(
@@ -233,8 +240,7 @@ def test_a_gamepad_jogs_with_a_shoulder_button_and_from_the_centre(desk: Visit, 
     assert desk.fake.received("held") == []  # the stick was not at its centre before
     desk.page.evaluate("() => { fakePad.axes = [0, 0, 0, 0]; }")
     desk.fake.let_pass(desk.page, 4)
-    desk.page.evaluate("() => { fakePad.axes = [0, -0.5, 0, 0]; }")
-    found = desk.fake.wait(desk.page, lambda f: f["received"][-1]["kind"] == "held")["received"][-1]
+    found = desk.press(*deflection(desk, [0, -0.5, 0, 0]))
     assert found["direction"] == [0, 1, 0]
     assert found["speed_mm_s"] == pytest.approx(2.5)
     desk.page.evaluate(end)
