@@ -146,7 +146,7 @@ def test_a_rehearsal_shows_the_reference_and_stores_nothing(tmp_path: Path) -> N
     answer = call("home", RIG, "--camera", "synthetic", "--pictures", "5", "--fast", "--json")
     assert answer.code == 0, answer
     document = json.loads(answer.out)
-    assert document["file"] is None
+    assert (document["file"], document["record"]) == (None, None)
     assert 0.0 < document["uncertainty_mm"] < 0.5
     assert len(document["home_counts"]) == 8
     assert min(document["tensions_n"]) >= 7.5
@@ -193,6 +193,19 @@ def test_one_cable_on_a_taut_platform_ends_in_a_reported_stop() -> None:
     answer = call("jog", RIG, "--cable", "3", "--mm", "0.01", "--fast", "--json")
     assert answer.code == 0, answer
     assert json.loads(answer.out)["moved_mm"] == pytest.approx(0.01, abs=0.002)
+
+
+def test_a_motion_of_winches_is_recorded_where_the_user_says(tmp_path: Path) -> None:
+    """Also with simulated drives, which leave no record unasked."""
+    for verb in (("home", RIG, "--at-home"), ("jog", RIG, "--cable", "3", "--mm", "0.01")):
+        folder = tmp_path / "records" / str(verb[0])
+        answer = call(*verb, "--fast", "--json", "-o", folder)
+        assert answer.code == 0, answer
+        assert json.loads(answer.out)["record"] == str(folder)
+        assert {"events.jsonl", "winches.csv"} <= {file.name for file in folder.iterdir()}
+        one_message(call(*verb, "--fast", "-o", folder), 2, "records")
+    unused = call("home", RIG, "--as-rig-file", "-o", tmp_path / "none")
+    one_message(unused, 2, "--as-rig-file neither moves nor measures")
 
 
 def test_a_lost_reference_can_be_dropped_for_what_absolute_encoders_count(tmp_path: Path) -> None:

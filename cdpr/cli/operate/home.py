@@ -63,6 +63,11 @@ def home(
         metavar="SOURCE",
     ),
     calibration: list[Path] | None = CALIBRATION,
+    output: Path | None = option(
+        "record folder to create (default: runs/home, runs/home-2 …; none with simulated drives)",
+        "-o",
+        "--output",
+    ),
     as_rig_file: bool = flag("move nothing: absolute encoders agree with the rig file"),
     winding: WindingOptions,
     interface: str | None = INTERFACE,
@@ -84,7 +89,8 @@ def home(
     if as_rig_file:
         if at_home or pose_mm or camera:
             homing.require_one_pose(False, None, [])
-        unused = given_options(winding) | given_options(motion) | {"--yes": None}
+        unused = given_options(winding) | given_options(motion)
+        unused |= {"--output": output, "--yes": None}
         require_unused("cdpr home", unused, "--as-rig-file neither moves nor measures")
         homing.use_rig_file_counts(the_rig, confirm=motion.confirmation(the_rig, as_json))
         if as_json:
@@ -103,11 +109,13 @@ def home(
         speed=winding.speed_mm_s / 1000.0,
         pictures=winding.pictures,
         simulated_slack=winding.simulated_slack_mm / 1000.0,
+        folder=output,
         **motion.arguments(the_rig, as_json),
     )
     if as_json:
-        file = None if result.file is None else str(result.file)
-        show_json({"file": file, **result.reference.model_dump(mode="json")})
+        written = {"file": result.file, "record": result.folder}
+        files = {name: path and str(path) for name, path in written.items()}
+        show_json({**files, **result.reference.model_dump(mode="json")})
     else:
         show_facts("drives homed; they hold", result.facts())
         same = words_of(interface=interface, channel=channel, calibration=calibration)

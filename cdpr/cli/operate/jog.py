@@ -132,7 +132,7 @@ def jog(
     distance: DistanceOptions,
     surroundings: SceneOptions,
     output: Path | None = option(
-        "run folder to create (default: runs/jog, runs/jog-2 …)", "-o", "--output"
+        "run folder to create (default: runs/jog or runs/jog-cable, runs/jog-2 …)", "-o", "--output"
     ),
     cable: int | None = option("move one winch by --mm", min=1),
     mm: float | None = option("length to pay out, at most 50; negative: wind in"),
@@ -162,11 +162,11 @@ def jog(
     """
     the_rig = bus.rig(rig)
     speed = speed_mm_s / 1000.0
-    path = given_options(distance) | given_options(surroundings) | {"--output": output}
+    path = given_options(distance) | given_options(surroundings)
     if cable is not None or mm is not None:
         why = "a single cable is moved without a path, and obstacles are not checked"
         require_unused("cdpr jog", path, why)
-        _one_cable(the_rig, cable, mm, limit_n, speed, motion, as_json)
+        _one_cable(the_rig, cable, mm, limit_n, speed, output, motion, as_json)
         return
     if not held.hold_to_run:
         require_unused("cdpr jog", {"--end-with": held.end_with}, "only with --hold-to-run")
@@ -176,7 +176,7 @@ def jog(
             "--simulated-start-wxyz": held.simulated_start_wxyz,
         }
         require_unused("cdpr jog", simulated_start, "only with --hold-to-run or --keys")
-    no_effect = {"--json": as_json, "--fast": motion.fast}
+    no_effect = {"--json": as_json, "--fast": motion.fast, "--output": output}
     if held.one_cable:
         if not held.hold_to_run or held.keys:
             raise BadInput(
@@ -193,7 +193,7 @@ def jog(
     why = "only with --cable or --one-cable; a path uses the rig's limits"
     require_unused("cdpr jog", {"--limit-n": limit_n}, why)
     if held.hold_to_run or held.keys:
-        unused = given_options(distance) | {"--output": output} | no_effect
+        unused = given_options(distance) | no_effect
         require_unused("cdpr jog", unused, "held controls set the direction, in real time")
         keys = JogKeys(Keys(), 1000.0 * min(speed, the_rig.motion.speed)) if held.keys else None
         session = partial(
@@ -345,6 +345,7 @@ def _one_cable(
     mm: float | None,
     limit_n: float | None,
     speed: float,
+    output: Path | None,
     motion: MotionOptions,
     as_json: bool,
 ) -> None:
@@ -360,12 +361,17 @@ def _one_cable(
         mm / 1000.0,
         limit=limit_n,
         speed=speed,
+        folder=output,
         **motion.arguments(rig, as_json),
     )
     moved_mm = done.moved * 1000.0
     tensions = [round(float(t), 2) for t in done.tensions]
     if as_json:
-        show_json({"cable": cable, "moved_mm": round(moved_mm, 4), "tensions_n": tensions})
+        record = done.folder and str(done.folder)
+        moved = {"cable": cable, "moved_mm": round(moved_mm, 4), "tensions_n": tensions}
+        show_json({**moved, "record": record})
         return
     out.print(f"cable {cable} moved by {moved_mm:+.3f} mm, positive pays out; the drives hold")
     show_line(f"tensions: {', '.join(f'{t:.1f}' for t in tensions)} N")
+    if done.folder:
+        show_line(f"record: {done.folder}")
