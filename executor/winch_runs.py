@@ -32,7 +32,7 @@ from executor.recording.run_folder import RunFolder
 from executor.remote.command_server import Commands
 from executor.remote.status import WinchStatus
 from executor.state_machine import REMARK, CycleRecord, LoopEvent, State
-from executor.supervision import LocalRequests
+from executor.supervision import Callbacks, GuardedListener, LocalRequests
 from model.errors import Fault, Refused, StoppedByOperator, path_of, real_number
 from model.pose import Pose
 from model.progress import Listener
@@ -118,12 +118,14 @@ def move_by_law(
         at_rest: See `AtRest`.
 
     Raises:
-        Fault: It ended with a fault, which is latched; with its cause.
+        Fault: It ended with a fault, which is latched; with its cause. Or a function of the
+            listener raised an exception, which stopped it.
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it, as does another signal handler's exception; the
             drives hold.
         CdprError: Nothing was enabled.
     """
+    callbacks = Callbacks(commands.board.ask_stop)
 
     def move() -> WinchResult:
         return move_supervised(
@@ -136,23 +138,28 @@ def move_by_law(
             clock=SimulatedClock(rig.cycle),
             need_real_time_rights=need_real_time_rights,
             listener=listener,
-            showing=_progress(listener),
+            callbacks=callbacks,
+            showing=_progress(GuardedListener(listener, callbacks)),
             rehome=rehome,
             at_rest=at_rest,
         )
 
-    return supervised(rig, commands, move)
+    return supervised(rig, commands, move, callbacks)
 
 
-def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) -> WinchResult:
+def supervised(
+    rig: Rig, commands: Commands, move: Callable[[], WinchResult], callbacks: Callbacks
+) -> WinchResult:
     """Moves while the supervisor can request a stop.
 
     Args:
         commands: Those taken since the start of the verb.
         move: Moves until the drives hold on their own.
+        callbacks: Functions of the caller that it calls.
 
     Raises:
-        Fault: It ended with a fault, which is latched; with its cause.
+        Fault: It ended with a fault, which is latched, with its cause; or one of ``callbacks``
+            raised an exception.
         StoppedByOperator: The operator stopped it.
         KeyboardInterrupt: Ctrl-C stopped it, as does another signal handler's exception; the
             drives hold.
@@ -162,6 +169,11 @@ def supervised(rig: Rig, commands: Commands, move: Callable[[], WinchResult]) ->
     result = supervisor.during(commands.board, move)
     if result.state in (State.STOPPED, State.FINISHED):
         supervisor.finish()
+        callbacks.leave()
+        if callbacks.error:
+            how = "was stopped" if result.state is State.STOPPED else "had finished"
+            why, next_step = f"the motion {how}; the drives hold", "correct this function"
+            raise Fault(callbacks.error, where="winches", why=why, next_step=next_step)
     if result.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="start again when ready")
     if result.state is not State.FINISHED:
@@ -237,6 +249,7 @@ def move_supervised(
     clock: Clock,
     need_real_time_rights: bool,
     listener: Listener,
+    callbacks: Callbacks,
     showing: AbstractContextManager[Callable[[CycleRecord], None]],
     presses: PressBoard | None = None,
     unreported: Collection[str] = _UNREPORTED,
@@ -250,6 +263,7 @@ def move_supervised(
         make_drives: See `open_mover`.
         status: Answers on the command socket.
         make_folder: See `record_folder`.
+        callbacks: Of the listener while drives are enabled.
         showing: Called after every cycle, before the status.
         presses: Where the command socket writes held controls.
         unreported: Codes of events that the listener does not get.
@@ -277,7 +291,13 @@ def move_supervised(
             moving,
             rig,
             interlock,
-            _Records(status, log, stack.enter_context(showing), listener, unreported),
+            _Records(
+                status,
+                log,
+                stack.enter_context(showing),
+                GuardedListener(listener, callbacks),
+                unreported,
+            ),
             record=log.folder if log is not None else interlock.file.path,
             rehome=rehome,
             at_rest=at_rest,

@@ -35,7 +35,7 @@ from executor.realtime.shared_memory import SharedMemory
 from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import CableStatus, JogStatus, SessionStatus
 from executor.state_machine import REMARK, CycleRecord
-from executor.supervision import RequestBoard, Supervisor
+from executor.supervision import Callbacks, RequestBoard, Supervisor
 from executor.winch_runs import limit_of, move_supervised, record_folder, supervised
 from model.errors import truth_value
 from model.pose import Pose
@@ -267,6 +267,8 @@ def _run(
     clock = SimulatedClock(rig.cycle)
     now = time.monotonic if realtime else lambda: clock.now
 
+    callbacks = Callbacks(commands.board.ask_stop)
+
     def session() -> WinchResult:
         with ExitStack() as stack:
             presses = PressBoard(now, cables)
@@ -294,10 +296,11 @@ def _run(
                 clock=clock,
                 need_real_time_rights=need_real_time_rights,
                 listener=listener,
+                callbacks=callbacks,
                 showing=nullcontext(take_cycle),
                 presses=presses,
                 # Its user must know when drives are enabled.
                 unreported={"moving", "traceback", REMARK},
             )
 
-    supervised(rig, commands, session)
+    supervised(rig, commands, session, callbacks)

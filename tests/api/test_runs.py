@@ -9,7 +9,9 @@ import os
 import re
 import shutil
 import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from html import escape
@@ -34,6 +36,7 @@ from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
 from model.pages.page import FactsDisplay
 from model.pose import matrix_from_rotation_vector, quaternion_from_matrix
+from model.progress import Advance, Listener
 from model.scene import empty_scene
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -428,6 +431,43 @@ def test_homing_shows_its_facts() -> None:
     assert repr(home).startswith("<HomeResult platform: ")
     assert home._repr_html_().count("<tr>") == len(home.facts())
     assert home.folder is None
+
+
+class Broken(Listener):
+    """Its progress raises, either in the motion or as it closes."""
+
+    def __init__(self, error: BaseException, *, closing: bool) -> None:
+        self.error, self.closing = error, closing
+
+    @contextmanager
+    def progress(self, text: str, total: float | None) -> Iterator[Advance]:
+        def advance(value: float, note: str = "", text: str = "") -> None:
+            if not self.closing:
+                raise self.error
+
+        yield advance
+        if self.closing:
+            raise self.error
+
+
+@pytest.mark.parametrize(
+    "move",
+    [partial(cdpr.home, at_home=True), lambda rig, **more: jog_cable(rig, 1, -1e-5, **more)],
+    ids=["home", "jog_cable"],
+)
+@pytest.mark.parametrize("closing", [False, True])
+def test_a_listener_that_fails_stops_winches_and_is_named(
+    move: Callable[..., object], closing: bool
+) -> None:
+    """It was called a failed recording, and the advice was to free disk space."""
+    rig = ready()[0]
+    with pytest.raises(cdpr.Fault, match=r"listener\.progress raised Runtime") as caught:
+        move(rig, realtime=False, listener=Broken(RuntimeError("no terminal"), closing=closing))
+    assert ("had finished" in caught.value.why) == closing
+    for error in (SystemExit(5), KeyboardInterrupt()):
+        with pytest.raises(type(error)) as left:
+            move(rig, realtime=False, listener=Broken(error, closing=closing))
+        assert left.value is error
 
 
 def test_the_record_of_winches_is_found_and_is_not_taken_for_a_run(

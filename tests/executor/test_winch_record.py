@@ -19,6 +19,7 @@ import pytest
 
 from executor.control.winch_motion import WinchResult, recording
 from executor.state_machine import CycleRecord, LoopEvent, State
+from executor.supervision import Callbacks
 from executor.winch_runs import record_folder, supervised
 from model.errors import BadInput, Fault, Refused
 from tests.configs import GACHON
@@ -41,7 +42,7 @@ def test_a_fault_leads_out_by_the_status_of_the_drives(interface: str) -> None:
     commands: Any = SimpleNamespace(supervisor=supervisor, board=None, require_no_stop=lambda: None)
     rig = GACHON if interface == "virtual" else GACHON.with_bus(interface, "can0")
     with pytest.raises(Fault, match="cable 2 is in fault") as caught:
-        supervised(rig, commands, lambda: result)
+        supervised(rig, commands, lambda: result, Callbacks(lambda: None))
     named = re.findall(r"`cdpr (\w+)", caught.value.next_step)
     assert named == ([] if interface == "virtual" else ["status", "release", "reset"])
 
