@@ -347,6 +347,11 @@ class DriveStatus:
     set_up: bool
     error: str = ""
 
+    @property
+    def state_with_error(self) -> str:
+        """Its state; with its node where it has an error."""
+        return f"drive {self.node} {self.state}: {self.error}" if self.error else self.state
+
 
 def drive_statuses(rig: Rig, seen: DriveSnapshot) -> tuple[DriveStatus, ...]:
     """The status of each drive that answered."""

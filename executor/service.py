@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict, dataclass, replace
@@ -54,7 +55,7 @@ from executor.remote.command_server import Commands, commands_from_start
 from executor.remote.status import WinchStatus, bus_name
 from executor.state_machine import State
 from executor.supervision import Supervisor, ctrl_c_interrupts
-from model.errors import CdprError, require_child_processes, truth_value
+from model.errors import CdprError, require_child_processes, require_types, truth_value
 from model.files.documents import PoseDocument
 from model.pages.page import FactsDisplay
 from model.pose import Pose
@@ -115,12 +116,12 @@ class StatusResult(FactsDisplay):
         if self.preparing:
             who = ", ".join(map(str, self.preparing))
             facts.append(("motion", f"process {who} is preparing one; `cdpr stop` cancels it"))
-        found = sorted({drive.state for drive in self.drives or ()})
+        found = sorted({drive.state_with_error for drive in self.drives or ()})
         found += [self.missing.what] if self.missing is not None else []
         if self.being_set_up:
             found = ["not read: another program is preparing a motion or reading them"]
         if found:
-            facts.append(("drives", ", ".join(found)))
+            facts.append(("drives", "; ".join(found)))
         if self.pose is not None:
             x, y, z = self.pose.position * 1000.0
             position = f"{x:z.2f}, {y:z.2f}, {z:z.2f} mm from the encoders, without a load"
@@ -140,6 +141,8 @@ class StatusResult(FactsDisplay):
             steps.append(f"find the cause; {how}")
         elif self.latched is not None or self.reference.valid_after_reset:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
+        elif any(re.search("fault|in error", drive.state) for drive in self.drives or ()):
+            steps.append(f"run cdpr reset {file}")
         if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
             steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")
         if self.reference.why_lost is not None:
@@ -208,8 +211,7 @@ def status(rig: Rig) -> StatusResult:
     latched, run = latch.read_in_motion()
     refusal = latch.why_not_reset(rig.name, latched) if latched else None
     motions = motions_on(bus_name(rig))  # also armed without the latch yet, or no longer with it
-    if run is None:
-        run = next((process for process, state in motions.items() if state != "preparing"), None)
+    run = run or next((one for one, state in motions.items() if state != "preparing"), None)
     ahead = (process for process, state in motions.items() if state == "preparing")
     preparing = tuple(process for process in ahead if process != run)
     known = StatusResult(
@@ -317,6 +319,7 @@ def reset(
         CdprError: A run is active; or a drive does not answer, may not be reset now, or stays in
             fault.
     """
+    require_types((rig, Rig), (listener, Listener))
     require_imported_script()
     require_child_processes("drives in real time")
     require_other_process(rig)
@@ -326,13 +329,12 @@ def reset(
     latch.require_no_run()
     require_confirmed(confirm, reset_proposal(str(settings), latched))
     interlock, motion = MotionInterlock(rig), StandstillMotion.of(FaultReset, rig)
-    make_drives = partial(resting_drives_of, rig.document, to_reset=True)
     with latch.held_for_reset(rig.name, latched):
         with (
             closing(SharedRequests()) as board,
             real_time_process(
                 motion,
-                make_drives,
+                partial(resting_drives_of, rig.document, to_reset=True),
                 board,
                 need_real_time=False,
                 check_drives=partial(abandoned_drives_fault, rig.document),
@@ -396,6 +398,7 @@ def release(
             winches have brakes; the drives could not be configured; or they were not released, and
             a fault is latched.
     """
+    require_types((rig, Rig), (listener, Listener))
     need_real_time_rights = truth_value("need_real_time_rights", need_real_time_rights)
     require_other_process(rig)
     interlock = MotionInterlock(rig)
@@ -413,10 +416,8 @@ def release(
             check_drives=partial(abandoned_drives_fault, rig.document),
             listener=listener,
         )
-        left = commands.supervisor.during(
-            commands.board,
-            lambda: _released(rig, interlock, commands, process, listener, under),
-        )
+        released = partial(_released, rig, interlock, commands, process, listener, under)
+        left = commands.supervisor.during(commands.board, released)
     commands.supervisor.finish()
     return ReleaseResult(
         drives=tuple(drive_states(rig, left.status_words.tolist())),

@@ -314,6 +314,20 @@ def test_status_states_the_error_of_a_drive_in_fault() -> None:
     assert shown.as_dict()["drives"][0]["error"] == over_voltage
 
 
+@pytest.mark.parametrize("state", ["fault", "fault reaction active", "idle, in error"])
+def test_a_drive_in_fault_is_named_and_has_to_be_reset_before_it_is_homed(state: str) -> None:
+    """A script saw neither the cause nor the step without which homing is refused."""
+    failed = DriveStatus(21, state, 0, 5.0, False, True, error="over-current (error 2310h)")
+    waits = DriveStatus(22, "switch on disabled", 0, 5.0, False, True, error="its STO is active")
+    lost = replace(REFERENCED, counts=False, why_not="never homed")
+    shown = dict(replace(STANDING, drives=(failed, waits), reference=lost).facts())
+    assert f"drive 21 {state}: over-current (error 2310h)" in shown["drives"]
+    steps = shown["next"].split("; then ")
+    assert steps[:2] == ["remove the cause shown for drive 21, 22", "run cdpr reset RIG"]
+    assert steps[2].startswith("cdpr home RIG")
+    assert "reset" not in replace(STANDING, drives=(waits,)).next_step()
+
+
 def test_monitor_calls_itself_by_its_name() -> None:
     with pytest.raises(Fault, match="no active run") as caught:
         request("status", None, verb="monitor")

@@ -257,7 +257,8 @@ def test_reset_and_status_name_the_drive_whose_safe_torque_off_is_still_active(
         drive.objects.measured(0x6041, 0, lambda: drive.status_word & ~0x10)
         status = call("status", slow_rig, *bus)
         assert status.code == 0, status
-        (line,) = [line for line in status.out.splitlines() if "STO" in line]
+        summary, line = [line for line in status.out.splitlines() if "STO" in line]
+        assert "drive 4 switch on disabled: " in summary
         assert "(drive 4)" in line
         assert "remove the cause shown for drive 4" in status.out.replace("\n", " ")
         answer = call("reset", slow_rig, *bus, "--yes")
