@@ -38,7 +38,7 @@ from executor.realtime.scheduling import (
     is_granted_priority,
     priority_limit,
 )
-from model.errors import BadInput, CdprError, InvalidFile, without_passwords
+from model.errors import BadInput, CdprError, InvalidFile, require_types, without_passwords
 from model.rig import Camera, Rig
 
 if TYPE_CHECKING:
@@ -114,6 +114,7 @@ def check_rig(
     Raises:
         BadInput: A source names no camera of the rig file.
     """
+    require_types((rig, Rig))
     sources = [] if camera is None else source_texts("camera", camera)
     detector = libraries({"pyapriltags": "pyapriltags"} if rig.tag_detector == "apriltag" else {})
     return [*detector, *rig_drives(rig), *rig_bus(rig), *rig_cameras(rig, sources)]

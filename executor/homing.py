@@ -256,6 +256,8 @@ def use_rig_file_counts(rig: Rig, *, confirm: Callable[[Proposal], bool] | None 
         StoppedByOperator: Cancelled.
         CdprError: Drives with brakes, whose last positions are known, cannot be read.
     """
+    require_types((rig, Rig))
+    require_functions(confirm=confirm)
     require_imported_script()
     interlock = MotionInterlock(rig)
 

@@ -134,7 +134,7 @@ def with_speed(rig: Rig, speed: float) -> Rig:
         raise BadInput(
             f"the speed of {speed:g} m/s must be above 0 and at most {FASTEST:g} m/s",
             where="jog",
-            next_step="give a smaller speed",
+            next_step="give one in this range",
         )
     document = rig.document
     slower = min(speed * 1000.0, document.motion.speed_mm_s)

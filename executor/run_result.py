@@ -106,7 +106,7 @@ class RunResult:
     def _next_step(self) -> str:
         """Next step after a failed run."""
         if self.summary["final_state"] in ("finished", "stopped"):
-            return "check the report for exceeded limits before the next run"
+            return "check the report, and correct what the reasons name, before the next run"
         if self.summary.get("interface") == IN_PROCESS:
             return "find the cause, then run again into a new folder"
         if not {event["code"] for event in self.summary["events"]}.isdisjoint(_RELEASES):

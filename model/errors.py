@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
+from inspect import iscoroutinefunction
 from multiprocessing import current_process
 from numbers import Integral, Real
 from os import PathLike, fspath
@@ -210,11 +211,11 @@ def require_functions(**given: object) -> None:
     """Requires functions, by the name of their argument; None for those left out.
 
     Raises:
-        BadInput: One cannot be called.
+        BadInput: One cannot be called, or is a coroutine function, which a call would not run.
     """
     for name, value in given.items():
-        if not (value is None or callable(value)):
-            raise _unusable(name, "a function", value)
+        if not (value is None or callable(value)) or iscoroutinefunction(value):
+            raise _unusable(name, "a function, without `async`", value)
 
 
 def require_child_processes(use: str, or_else: str = "") -> None:
@@ -329,6 +330,8 @@ def path_of(value: object) -> Path:
     if not isinstance(value, str | PathLike) or not isinstance(fspath(value), str):
         raise _unusable("the path", "a str or a pathlib.Path", value)
     require_not_empty("the path", text := fspath(value))
+    if "\0" in text:
+        raise _unusable("the path", "without a null character", value)
     return Path(text)
 
 

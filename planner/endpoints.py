@@ -171,7 +171,8 @@ def _require_same_orientation(scene: Scene, leg: Leg) -> None:
             where=f"scene {leg.scene.name}",
             why="without `free_rotation=True` the search keeps the platform's orientation",
             next_step="plan with `planner='optimal'` and `free_rotation=True` (the scene then needs"
-            f" rotation_limits), or give the {leg.end} the start's rotation_wxyz",
+            f" rotation_limits), or give the {leg.end} the start's rotation_wxyz; in Python a"
+            " measured start may take the goal's: cdpr.Pose(pose.position, scene.goal.rotation)",
             values={"angle_deg": float(np.degrees(angle))},
         )
 

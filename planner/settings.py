@@ -48,7 +48,7 @@ def whole_number(name: str, value: int, least: int = 0, most: int = WHOLE_LARGES
     except TypeError:
         number = None
     if number is None or not least <= number <= most:
-        raise BadInput(f"{name} must be a whole number from {least} to {most}, it is {value!s}")
+        raise BadInput(f"{name} must be a whole number from {least} to {most}, it is {value!r}")
     return number
 
 

@@ -22,6 +22,8 @@ import yaml
 import calibration
 import cdpr
 from executor.cameras.sources import choose_camera
+from executor.doctor import check_rig
+from executor.homing import use_rig_file_counts
 from executor.jogging import jog_cable
 from model.files.documents import PoseDocument
 from model.files.scene_file import StopDocument
@@ -666,6 +668,10 @@ def test_only_errors_of_cdpr_come_from_wrong_arguments(
 def test_a_wrong_argument_is_named_with_its_value(
     rig: cdpr.Rig, scene: cdpr.Scene, plan: cdpr.Plan
 ) -> None:
+    on_bus = rig.with_bus("udp_multicast", "239.74.163.77:43999")
+
+    async def coroutine(_event: object) -> None: ...
+
     for call, text in (
         (lambda: cdpr.plan(rig, scene, budget="1"), "budget must be a number [s], it is '1' (str)"),
         (lambda: cdpr.plan(rig, scene, longest=[1.0]), "longest must be a number [m]"),
@@ -696,6 +702,14 @@ def test_a_wrong_argument_is_named_with_its_value(
         (lambda: scene.changed(stops=[{"name": "a"}]), "expected a StopDocument, not dict"),
         (lambda: scene.changed(stops="x"), "stops must be a list, it is 'x'"),
         (lambda: cdpr.run(plan, rig, supervisor=3), "expected a Supervisor, not int"),
+        (lambda: cdpr.run(plan, rig, on_event=coroutine), "a function, without `async`, it is <f"),
+        (lambda: cdpr.run(plan, rig, folder="a\0b"), "without a null character, it is 'a\\x00b'"),
+        (lambda: cdpr.reset(on_bus, listener=print), "expected a Listener, not builtin"),
+        (lambda: cdpr.release(on_bus, listener=print), "expected a Listener, not builtin"),
+        (lambda: check_rig("rig.yaml"), "expected a Rig, not text"),
+        (lambda: use_rig_file_counts("rig.yaml"), "expected a Rig, not text"),
+        (lambda: use_rig_file_counts(on_bus, confirm="y"), "confirm must be a function"),
+        (lambda: jog_cable(rig, "1", 0.001), "it is '1'"),
         (lambda: plan.save(3), "the path must be a str or a pathlib.Path, it is 3 (int)"),
     ):
         with pytest.raises(cdpr.BadInput, match=re.escape(text)):
