@@ -110,8 +110,8 @@ def paper(
 
     Compares adaptive sampling with goal bias and kinematic cost with length, in three environments,
     with the scene's start and goal and with random ones, in the rig's workspace box and in larger
-    ones, and for every reading of the text. Writes index.html, images, trials.csv, summary.csv and
-    findings.json. Apart from times, the numbers depend only on the seeds.
+    ones, and for every reading of sampling and steps. Writes index.html, images, trials.csv,
+    summary.csv and findings.json. Apart from times, the numbers depend only on the seeds.
 
     Example:
       cdpr bench paper --seeds 100 -o bench-paper

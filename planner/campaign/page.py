@@ -78,7 +78,7 @@ def page(results: Results, about: dict[str, Any]) -> str:
         section("claims", "Claims", _claims(results), reading),
         section("figure-9", "Fig. 9", *figure_9),
         section("difference", "What makes the difference", _comparisons(results)),
-        section("readings", "Every reading of the text", readings, _readings(results)),
+        section("readings", "Every reading of sampling and steps", readings, _readings(results)),
         section("boxes", "The box", boxes, _boxes(results)),
         section("about", "About this run", table(rows)),
     ]

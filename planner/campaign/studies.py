@@ -242,23 +242,27 @@ def change_of_means(pairs: Sequence[tuple[Array, Array]]) -> Change:
 
 
 def change_of_deviations(pairs: Sequence[tuple[Array, Array]]) -> Change:
-    """Change of the standard deviation; see `change_of_means`."""
+    """Change of the standard deviation; see `change_of_means`.
+
+    Resamples that repeat one value have none, and are left out.
+    """
     return _change(pairs, _deviation, 2)
 
 
 def _change(
     pairs: Sequence[tuple[Array, Array]], figure: Callable[[Array], Array], least: int
 ) -> Change:
-    """The change of a figure that needs a sample of at least this size."""
+    """The change of a figure that needs a sample of at least this size; NaN for one it lacks."""
     each, resampled = np.full(len(pairs), np.nan), []
     for k, (one, other) in enumerate(pairs):
         if len(one) >= least:
-            rows = _resampled(len(one), k)
             each[k] = figure(one[None])[0] / figure(other[None])[0] - 1.0
+        if not np.isnan(each[k]):
+            rows = _resampled(len(one), k)
             resampled.append(figure(one[rows]) / figure(other[rows]) - 1.0)
     if not resampled:
         return Change(tuple(each.tolist()), np.nan, np.nan, np.nan)
-    low, high = (float(x) for x in np.percentile(sum(resampled) / len(resampled), _LEVELS))
+    low, high = (float(x) for x in np.nanpercentile(sum(resampled) / len(resampled), _LEVELS))
     return Change(tuple(each.tolist()), float(np.mean(each[~np.isnan(each)])), low, high)
 
 
@@ -268,8 +272,8 @@ def _mean(samples: Array) -> Array:
 
 
 def _deviation(samples: Array) -> Array:
-    deviations: Array = np.maximum(samples.std(axis=1, ddof=1), 1e-300)
-    return deviations
+    deviations: Array = samples.std(axis=1, ddof=1)
+    return np.where(deviations > 0.0, deviations, np.nan)
 
 
 def _resampled(size: int, stream: int = 0) -> NDArray[np.int64]:

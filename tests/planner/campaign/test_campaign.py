@@ -28,6 +28,7 @@ from planner.campaign.studies import (
     Results,
     all_readings,
     batches,
+    change_of_deviations,
     change_of_means,
     figure_9_arm,
     findings,
@@ -230,6 +231,24 @@ def test_samples_tied_by_their_seeds_are_resampled_together() -> None:
 def test_a_verdict_says_no_more_than_the_interval_allows(low, mean, high, claimed, verdict) -> None:
     finding = Finding("claim", claimed, OWN, "scene", Change((mean,), mean, low, high))
     assert finding.verdict == verdict
+
+
+def test_deviations_are_compared_where_there_are_some() -> None:
+    """Three seeds had a change of up to 10^284 %: one of them, drawn three times, has none."""
+    random = np.random.default_rng(3)
+    one, other = random.normal(size=(2, 12))
+    few = change_of_deviations([(one[:3], other[:3])])
+    assert -1.0 < few.low <= few.mean <= few.high < 100.0
+    alike = np.ones(12)
+    both = change_of_deviations([(one, other), (one, alike), (alike, alike)])
+    alone = change_of_deviations([(one, other)])
+    assert np.isnan(both.each[1:]).all()
+    assert (both.each[0], both.mean, both.low, both.high) == (
+        alone.each[0], alone.mean, alone.low, alone.high
+    )  # fmt: skip
+    tied = np.where(np.arange(12) == 0, 1.0, 0.0)  # a third of its resamples are alike
+    rare = change_of_deviations([(tied, tied[::-1])])
+    assert -1.0 <= rare.low <= rare.mean == 0.0 <= rare.high < 10.0
 
 
 def test_only_seeds_with_which_both_found_a_path_are_compared(results) -> None:
