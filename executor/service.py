@@ -329,28 +329,28 @@ def reset(
     latch.require_no_run()
     require_confirmed(confirm, reset_proposal(str(settings), latched))
     interlock, motion = MotionInterlock(rig), StandstillMotion.of(FaultReset, rig)
-    with latch.held_for_reset(rig.name, latched):
-        with (
-            closing(SharedRequests()) as board,
-            real_time_process(
-                motion,
-                partial(resting_drives_of, rig.document, to_reset=True),
-                board,
-                need_real_time=False,
-                check_drives=partial(abandoned_drives_fault, rig.document),
-                listener=listener,
-            ) as process,
-        ):
-            done = reset_drives(interlock, process)
-        for remark in unready_remarks(rig, done.left.status_words.tolist()):
-            listener.remark(f"{remark}; correct this before a motion")
-        return ResetResult(
-            was_latched=latched is not None,
-            cause=latched.cause if latched else None,
-            drives=tuple(drive_states(rig, done.left.status_words.tolist())),
-            restarted=done.restarted,
-            reference=reference_status(interlock, done.left.positions.tolist()),
-        )
+    with (
+        latch.held_for_reset(rig.name, latched),
+        closing(SharedRequests()) as board,
+        real_time_process(
+            motion,
+            partial(resting_drives_of, rig.document, to_reset=True),
+            board,
+            need_real_time=False,
+            check_drives=partial(abandoned_drives_fault, rig.document),
+            listener=listener,
+        ) as process,
+    ):
+        done = reset_drives(interlock, process)
+    for remark in unready_remarks(rig, done.left.status_words.tolist()):
+        listener.remark(f"{remark}; correct this before a motion")
+    return ResetResult(
+        was_latched=latched is not None,
+        cause=latched.cause if latched else None,
+        drives=tuple(drive_states(rig, done.left.status_words.tolist())),
+        restarted=done.restarted,
+        reference=reference_status(interlock, done.left.positions.tolist()),
+    )
 
 
 @dataclass(frozen=True, slots=True, repr=False)

@@ -15,6 +15,7 @@ from cdpr.cli.options import rig_on_bus
 from drivers.can_bus import BusSettings, open_bus
 from drivers.cia402.pdo import NmtState
 from drivers.cia402.state_machine import DriveState
+from executor import service
 from executor.doctor import examine
 from executor.drives import read_snapshot, resting_drives_of
 from executor.interlock.fault_latch import FaultLatch
@@ -23,7 +24,8 @@ from executor.remote.command_socket import find_runs
 from executor.state_machine import State
 from executor.trajectory.setpoints import PreparedRun
 from model.errors import Refused
-from model.rig import rig_from_document
+from model.progress import Listener
+from model.rig import load_rig, rig_from_document
 from model.scene import empty_scene
 from tests.cli.plans import RIG
 from tests.cli.program import call
@@ -243,6 +245,11 @@ def test_reset_brings_a_drive_out_of_its_fault_and_moves_nothing(
     latch.require_disengaged()
 
 
+class Raising(Listener):
+    def remark(self, text: str) -> None:
+        raise RuntimeError(text)
+
+
 @pytest.mark.slow
 @pytest.mark.real_time
 def test_reset_and_status_name_the_drive_whose_safe_torque_off_is_still_active(
@@ -261,6 +268,9 @@ def test_reset_and_status_name_the_drive_whose_safe_torque_off_is_still_active(
         assert "drive 4 switch on disabled: " in summary
         assert "(drive 4)" in line
         assert "remove the cause shown for drive 4" in status.out.replace("\n", " ")
+        with pytest.raises(RuntimeError, match="STO"):  # the reset is done by then
+            service.reset(load_rig(slow_rig).with_bus("udp_multicast", channel), listener=Raising())
+        FaultLatch(BusSettings("udp_multicast", channel)).require_disengaged()
         answer = call("reset", slow_rig, *bus, "--yes")
         assert answer.code == 0, answer
     (said,) = [line for line in answer.err.splitlines() if "STO" in line]
