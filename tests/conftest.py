@@ -29,12 +29,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 import pytest  # noqa: E402
 from hypothesis import settings  # noqa: E402
 
-from tests.held_up import LIMIT_S, REPEATS, HoldUp, reports_late_cycles  # noqa: E402
+from tests.held_up import LATE, LIMIT_S, REPEATS, HoldUp, reports_late_cycles  # noqa: E402
 
 ROOT = Path(__file__).parents[1]
 GRACE_S = 2.0  # for a thread that was told to end and is just returning
 HELD_UP = pytest.StashKey[HoldUp]()
-LATE = pytest.StashKey[bool]()
 
 settings.register_profile("ci", derandomize=True, deadline=None, max_examples=40, print_blob=True)
 settings.register_profile("explore", deadline=None, max_examples=1000, print_blob=True)

@@ -2,7 +2,8 @@
 
 Such a test depends on programs that are woken on time. Where they were not, a run rightly stops,
 and its failure says nothing about the code: it is done again. So is one in which a process of a
-run, which no thread of the test can watch, began a cycle late. On a computer that kept time a
+run, which no thread of the test can watch, began a cycle late; so is one of a page whose data were
+stale for a moment, as it then refuses what is pressed. On a computer that kept time a
 failure counts at once.
 """
 
@@ -12,11 +13,16 @@ import re
 import threading
 import time
 
+import pytest
+
 PERIOD_S = 0.01
 LIMIT_S = 0.02
 """A quiet computer wakes a thread within a few milliseconds, also beside one that computes."""
 REPEATS = 9
 """Two suites beside four busy loops on two cores spoil two of three attempts at the longest."""
+
+LATE = pytest.StashKey[bool]()
+"""Whether a failed test says that something else than its own thread was held up."""
 
 
 def reports_late_cycles(failure: str) -> bool:

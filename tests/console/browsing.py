@@ -22,6 +22,7 @@ import pytest
 from playwright.sync_api import (
     Browser,
     ConsoleMessage,
+    Error,
     FloatRect,
     Mouse,
     Page,
@@ -51,6 +52,14 @@ VIEWS = ("live", "operate", "jog", "teach", "events", "service")
 AUDITS = (Path(__file__).parent / "audits.js").read_text(encoding="utf-8")
 SIZES = {"phone": (390, 844), "tablet": (1024, 768), "desk": (1400, 900)}
 
+#: Notes on the page how often its data became stale from now on.
+NOTE_STALE = """() => {
+  const stale = document.getElementById("stale");
+  window.wentStale = 0;
+  const note = new MutationObserver(() => { window.wentStale += !stale.hidden; });
+  note.observe(stale, { attributeFilter: ["hidden"] });
+}"""
+
 #: The page of each browser that the next visit has, by whether it takes touches.
 _KEPT: WeakKeyDictionary[Browser, dict[bool, Page]] = WeakKeyDictionary()
 
@@ -60,9 +69,14 @@ expect.set_options(timeout=1000.0 * PATIENCE_S)
 
 @dataclass
 class Fake:
-    """Client of the fake server."""
+    """Client of the fake server.
+
+    Attributes:
+        silenced: Whether it was told since this was set to send nothing for a while.
+    """
 
     address: str
+    silenced: bool = False
 
     @property
     def origin(self) -> str:
@@ -70,6 +84,7 @@ class Fake:
 
     def ask(self, **hooks: Any) -> dict[str, Any]:
         """Messages received so far, after ``hooks`` were set."""
+        self.silenced |= "silent" in hooks
         data = json.dumps(hooks).encode() if hooks else None
         with urllib.request.urlopen(f"{self.origin}/fake", data=data, timeout=10) as answer:
             found = json.load(answer)
@@ -110,6 +125,12 @@ class Visit:
         found = self.page.evaluate(f"() => [({script}).{name}({of})].flat()")
         assert isinstance(found, list)
         return found
+
+    def was_held_up(self) -> bool:
+        """Whether data were stale, though the server was not told to be silent."""
+        with contextlib.suppress(Error):  # the page may be closed
+            return not self.fake.silenced and bool(self.page.evaluate("() => window.wentStale"))
+        return False
 
     def view(self, name: str) -> None:
         """Selects a view, if it is not shown already."""
@@ -340,6 +361,7 @@ def visit(browser: Browser, fake: Fake, size: str = "desk", script: str = "") ->
     """
     width, height = SIZES[size]
     fake.ask(renew=True)
+    fake.silenced = False
     kept = _KEPT.setdefault(browser, {})
     touch = size != "desk"
     page = None if script else kept.pop(touch, None)
@@ -357,6 +379,7 @@ def visit(browser: Browser, fake: Fake, size: str = "desk", script: str = "") ->
             expect(page.locator("#value-x")).to_contain_text(".")
             expect(page.locator("#layers label")).not_to_have_count(0)  # the scene is there
             page.evaluate("() => new Promise((done) => requestAnimationFrame(done))")
+            page.evaluate(NOTE_STALE)
             yield found
         if not script:
             for button in ("left", "right"):

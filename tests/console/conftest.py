@@ -9,6 +9,7 @@ from playwright.sync_api import Browser
 
 from tests.console import browsing
 from tests.console.browsing import Fake, Visit, visit
+from tests.held_up import LATE
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +27,19 @@ def fake(browser: Browser) -> Iterator[Fake]:
 
 
 @pytest.fixture
-def desk(browser: Browser, fake: Fake) -> Iterator[Visit]:
-    with visit(browser, fake) as found:
-        yield found
+def desk(request: pytest.FixtureRequest, browser: Browser, fake: Fake) -> Iterator[Visit]:
+    yield from _visited(request, browser, fake, "desk")
 
 
 @pytest.fixture
-def phone(browser: Browser, fake: Fake) -> Iterator[Visit]:
-    with visit(browser, fake, "phone") as found:
+def phone(request: pytest.FixtureRequest, browser: Browser, fake: Fake) -> Iterator[Visit]:
+    yield from _visited(request, browser, fake, "phone")
+
+
+def _visited(
+    request: pytest.FixtureRequest, browser: Browser, fake: Fake, size: str
+) -> Iterator[Visit]:
+    with visit(browser, fake, size) as found:
         yield found
+        stash = request.node.stash
+        stash[LATE] = stash.get(LATE, False) or found.was_held_up()

@@ -15,6 +15,16 @@ WEBGL = False
 STALE = re.compile("No data from the console’s server")
 
 
+def test_data_that_become_stale_unasked_are_a_hold_up(desk: Visit) -> None:
+    """A test that then fails is repeated, unless it silenced the server itself."""
+    busy = "() => { const began = performance.now(); while (performance.now() - began < 1000); }"
+    desk.page.evaluate(busy)
+    desk.fake.let_pass(desk.page, 2)
+    assert desk.was_held_up()
+    desk.blink()
+    assert not desk.was_held_up()
+
+
 # STOP.
 
 
