@@ -400,26 +400,20 @@ def write_atomic(path: Path, text: str, *, durable: bool = False) -> None:
 
 
 def write_bytes_atomic(path: Path, data: bytes, *, durable: bool = False) -> None:
-    """Writes a whole file or nothing; a file that exists keeps its permissions.
+    """Writes a whole file or nothing.
 
     Args:
-        durable: As for `keep_names`. All users may read such a file, and a link is replaced; else
-            the file that a link names is written.
+        durable: As for `keep_names`.
 
     Raises:
         BadInput: The folder is missing, cannot be written to or is full.
     """
-    mode = 0o644
     try:
-        if path.is_symlink() and not durable:
-            path = Path(os.path.realpath(path))
         if path.is_dir():
             raise BadInput("this is a folder", where=str(path), next_step="name a file")
         if path.exists() and not path.is_file():
             what = "not a regular file but a device, a pipe or a socket"
             raise BadInput(what, where=str(path), next_step="name a file")
-        if path.exists() and not durable:
-            mode = path.stat().st_mode & 0o777
         handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:40]}.")
     except OSError as error:
         hint = "choose an existing folder with write permission"
@@ -430,7 +424,7 @@ def write_bytes_atomic(path: Path, data: bytes, *, durable: bool = False) -> Non
             stream.flush()
             os.fsync(handle)  # or a power failure could leave the new name on an empty file
         with suppress(PermissionError):  # a mount that gives all files one owner and mode
-            Path(temporary).chmod(mode)
+            Path(temporary).chmod(0o644)
         if durable:
             keep_names(path.parent, durable=True)  # refuses before anything is replaced
         Path(temporary).replace(path)

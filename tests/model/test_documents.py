@@ -75,30 +75,6 @@ def test_a_file_is_replaced_whole_and_nothing_else_is_left(tmp_path: Path) -> No
     assert path.stat().st_mode & 0o777 == 0o644
 
 
-def test_a_file_that_exists_keeps_its_permissions(tmp_path: Path) -> None:
-    """Such as a rig file that a group shares, or one that is nobody else's business."""
-    path = tmp_path / "file.json"
-    for mode in (0o664, 0o600):
-        path.touch()
-        path.chmod(mode)
-        write_atomic(path, "new")
-        assert (path.read_text(), path.stat().st_mode & 0o777) == ("new", mode)
-
-
-def test_a_link_is_followed_but_for_what_users_share(tmp_path: Path) -> None:
-    """Else the rig file that a link names would keep its old values, and the link be gone."""
-    file, link, loop = tmp_path / "rigs" / "2026.yaml", tmp_path / "rig.yaml", tmp_path / "loop"
-    file.parent.mkdir()
-    link.symlink_to(Path("rigs") / "2026.yaml")
-    write_atomic(link, "first")
-    assert (link.is_symlink(), file.read_text()) == (True, "first")
-    write_atomic(link, "shared", durable=True)
-    assert (link.is_symlink(), file.read_text(), link.read_text()) == (False, "first", "shared")
-    loop.symlink_to(loop)
-    write_atomic(loop, "whole")
-    assert loop.read_text() == "whole"
-
-
 @pytest.mark.parametrize("step", ["fsync", "replace"])
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
 def test_a_failed_write_leaves_the_old_file_and_no_other(
