@@ -244,7 +244,7 @@ def change_of_means(pairs: Sequence[tuple[Array, Array]]) -> Change:
 def change_of_deviations(pairs: Sequence[tuple[Array, Array]]) -> Change:
     """Change of the standard deviation; see `change_of_means`.
 
-    Resamples that repeat one value have none, and are left out.
+    Where only the second sample has none, the change is unknown, and such resamples are left out.
     """
     return _change(pairs, _deviation, 2)
 
@@ -256,10 +256,10 @@ def _change(
     each, resampled = np.full(len(pairs), np.nan), []
     for k, (one, other) in enumerate(pairs):
         if len(one) >= least:
-            each[k] = figure(one[None])[0] / figure(other[None])[0] - 1.0
+            each[k] = _relative(figure(one[None]), figure(other[None]))[0]
         if not np.isnan(each[k]):
             rows = _resampled(len(one), k)
-            resampled.append(figure(one[rows]) / figure(other[rows]) - 1.0)
+            resampled.append(_relative(figure(one[rows]), figure(other[rows])))
     if not resampled:
         return Change(tuple(each.tolist()), np.nan, np.nan, np.nan)
     low, high = (float(x) for x in np.nanpercentile(sum(resampled) / len(resampled), _LEVELS))
@@ -273,7 +273,13 @@ def _mean(samples: Array) -> Array:
 
 def _deviation(samples: Array) -> Array:
     deviations: Array = samples.std(axis=1, ddof=1)
-    return np.where(deviations > 0.0, deviations, np.nan)
+    return np.where(np.ptp(samples, axis=1) > 0.0, deviations, 0.0)  # exactly, whatever the mean
+
+
+def _relative(one: Array, other: Array) -> Array:
+    """Relative change; 0 where both are 0, NaN where only the other is."""
+    both = np.where(one > 0.0, np.nan, 0.0)
+    return np.divide(one - other, other, out=both, where=other > 0.0)
 
 
 def _resampled(size: int, stream: int = 0) -> NDArray[np.int64]:

@@ -239,10 +239,12 @@ def test_deviations_are_compared_where_there_are_some() -> None:
     one, other = random.normal(size=(2, 12))
     few = change_of_deviations([(one[:3], other[:3])])
     assert -1.0 < few.low <= few.mean <= few.high < 100.0
-    alike = np.ones(12)
-    both = change_of_deviations([(one, other), (one, alike), (alike, alike)])
+    alike = np.full(12, 0.1)  # its mean is not exactly 0.1
+    both = change_of_deviations([(one, other), (one, alike)])
     alone = change_of_deviations([(one, other)])
-    assert np.isnan(both.each[1:]).all()
+    none = change_of_deviations([(alike, alike)])
+    assert (*none.each, none.mean, none.low, none.high) == (0.0, 0.0, 0.0, 0.0)
+    assert np.isnan(both.each[1])
     assert (both.each[0], both.mean, both.low, both.high) == (
         alone.each[0], alone.mean, alone.low, alone.high
     )  # fmt: skip
