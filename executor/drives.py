@@ -337,6 +337,7 @@ class DriveStatus:
         set_up: It has the configuration for this rig: no power cycle or other cycle time since.
         error: The error that a drive in fault stores, or why one at rest cannot be enabled; empty
             without one.
+        in_fault: It has to be reset.
     """
 
     node: int
@@ -346,10 +347,11 @@ class DriveStatus:
     has_torque: bool
     set_up: bool
     error: str = ""
+    in_fault: bool = False
 
     @property
     def state_with_error(self) -> str:
-        """Its state; with its node where it has an error."""
+        """State; with node and error if there is one."""
         return f"drive {self.node} {self.state}: {self.error}" if self.error else self.state
 
 
@@ -373,6 +375,7 @@ def drive_statuses(rig: Rig, seen: DriveSnapshot) -> tuple[DriveStatus, ...]:
             has_torque=flags.torque != "none",
             set_up=winch.node_id not in seen.restarted,
             error=error,
+            in_fault=flags.in_fault,
         )
         for winch, state, flags, position, torque, error in columns
     )

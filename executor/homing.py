@@ -148,7 +148,8 @@ def home(
         BadInput: An argument cannot be used.
         Refused: The bus is latched, a limit cannot be kept, or the pose is too uncertain.
         HardwareMissing: A drive or the camera does not answer.
-        Fault: It ended with a fault, which is latched; all drives stopped together and hold.
+        Fault: It ended with a fault, which is latched; all drives stopped together and hold. Or a
+            function of the listener raised an exception, which stops the motion and latches none.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(pose, Pose)])
@@ -295,7 +296,7 @@ def _require_slow(reach: float, speed: float) -> None:
             raise BadInput(
                 f"the {name} of {value:g} {unit} must be above 0 and at most {largest:g} {unit}",
                 where="home",
-                next_step=f"give a smaller {name}",
+                next_step=f"give a {name} in this range",
             )
 
 

@@ -316,7 +316,8 @@ def jog_cable(
     Raises:
         BadInput: There is no such cable, the length is zero, or an argument is of another type.
         Refused: The length is too long, or the bus is latched.
-        Fault: A tension left its limits; all drives stopped together.
+        Fault: A tension left its limits, which is latched; all drives stopped together. Or a
+            function of the listener raised an exception, which stops the motion and latches none.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     require_types((rig, Rig), (listener, Listener))

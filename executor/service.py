@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing
 from dataclasses import asdict, dataclass, replace
@@ -141,7 +140,7 @@ class StatusResult(FactsDisplay):
             steps.append(f"find the cause; {how}")
         elif self.latched is not None or self.reference.valid_after_reset:
             steps.append(f"find the cause and check the platform, then run cdpr reset {file}")
-        elif any(re.search("fault|in error", drive.state) for drive in self.drives or ()):
+        elif any(drive.in_fault for drive in self.drives or ()):
             steps.append(f"run cdpr reset {file}")
         if failed := [str(drive.node) for drive in self.drives or () if drive.error]:
             steps.insert(0, f"remove the cause shown for drive {', '.join(failed)}")

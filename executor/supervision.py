@@ -142,12 +142,14 @@ class Callbacks:
 
     Attributes:
         error: The first exception, as a clause; empty for none.
+        cause: That exception.
         leaving: `KeyboardInterrupt` or `SystemExit` of a function, to raise after the record.
     """
 
     def __init__(self, ask_stop: Callable[..., None]) -> None:
         """``ask_stop`` is `RequestBoard.ask_stop`."""
         self.error = ""
+        self.cause: Exception | None = None
         self.leaving: BaseException | None = None
         self._ask_stop = ask_stop
 
@@ -160,7 +162,7 @@ class Callbacks:
             except Exception as error:
                 text = error.what if isinstance(error, CdprError) else str(error)
                 what = f"{name} raised {type(error).__name__}: {text}".rstrip(": ")
-                self.error = self.error or what
+                self.error, self.cause = self.error or what, self.cause or error
                 raise CallbackFailed(what) from error
             except BaseException as error:
                 self.leaving = self.leaving or error

@@ -144,11 +144,17 @@ def move_by_law(
             at_rest=at_rest,
         )
 
-    return supervised(rig, commands, move, callbacks)
+    stored = ", and the reference is stored" if rehome else ""
+    return supervised(rig, commands, move, callbacks, stored=stored)
 
 
 def supervised(
-    rig: Rig, commands: Commands, move: Callable[[], WinchResult], callbacks: Callbacks
+    rig: Rig,
+    commands: Commands,
+    move: Callable[[], WinchResult],
+    callbacks: Callbacks,
+    *,
+    stored: str = "",
 ) -> WinchResult:
     """Moves while the supervisor can request a stop.
 
@@ -156,24 +162,27 @@ def supervised(
         commands: Those taken since the start of the verb.
         move: Moves until the drives hold on their own.
         callbacks: Functions of the caller that it calls.
+        stored: What is stored once it has finished, as a clause.
 
     Raises:
         Fault: It ended with a fault, which is latched, with its cause; or one of ``callbacks``
-            raised an exception.
+            raised an exception, which stopped it.
         StoppedByOperator: The operator stopped it.
+        SystemExit: Raised by one of ``callbacks``, as `KeyboardInterrupt` may be.
         KeyboardInterrupt: Ctrl-C stopped it, as does another signal handler's exception; the
             drives hold.
     """
     supervisor = commands.supervisor
     commands.require_no_stop()
-    result = supervisor.during(commands.board, move)
+    try:
+        result = supervisor.during(commands.board, move)
+    except StoppedByOperator:  # after the motion, such as while the platform is measured
+        _raise_failure(callbacks, "was stopped")
+        raise
     if result.state in (State.STOPPED, State.FINISHED):
         supervisor.finish()
-        callbacks.leave()
-        if callbacks.error:
-            how = "was stopped" if result.state is State.STOPPED else "had finished"
-            why, next_step = f"the motion {how}; the drives hold", "correct this function"
-            raise Fault(callbacks.error, where="winches", why=why, next_step=next_step)
+        how = "was stopped" if result.state is State.STOPPED else f"had finished{stored}"
+        _raise_failure(callbacks, how)
     if result.state is State.STOPPED:
         raise StoppedByOperator("stopped; the drives hold", next_step="start again when ready")
     if result.state is not State.FINISHED:
@@ -184,6 +193,15 @@ def supervised(
             next_step = AFTER_A_FAULT
         raise Fault(result.cause, where="winches", why=why, next_step=next_step)
     return result
+
+
+def _raise_failure(callbacks: Callbacks, how: str) -> None:
+    """Raises what a function of the caller raised, and how the motion ended."""
+    callbacks.leave()
+    if callbacks.error:
+        why, next_step = f"the motion {how}; the drives hold", "correct this function"
+        error = Fault(callbacks.error, where="winches", why=why, next_step=next_step)
+        raise error from callbacks.cause
 
 
 @contextmanager
@@ -296,6 +314,7 @@ def move_supervised(
                 log,
                 stack.enter_context(showing),
                 GuardedListener(listener, callbacks),
+                listener.remark,
                 unreported,
             ),
             record=log.folder if log is not None else interlock.file.path,
@@ -308,12 +327,16 @@ def move_supervised(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Records:
-    """Forwards cycles and events to the status, the listener and the record."""
+    """Forwards cycles and events to the status, the listener and the record.
+
+    ``remark`` may raise: it is called before the drives are enabled.
+    """
 
     status: WinchStatus
     log: WinchRecord | None
     show: Callable[[CycleRecord], None]
     listener: Listener
+    remark: Callable[[str], None]
     unreported: Collection[str]
 
     def take_cycle(self, record: CycleRecord, _true_pose: Pose | None) -> None:
@@ -325,7 +348,7 @@ class _Records:
     def take_event(self, event: LoopEvent) -> None:
         self.status.take_event(event)
         if event.code == "no_real_time":
-            self.listener.remark(event.text)
+            self.remark(event.text)
         elif event.code not in self.unreported:
             self.listener.note(f"{event.code}: {event.text}")
         if self.log is not None:  # last: a full disk must not prevent the report

@@ -82,7 +82,8 @@ def jog_session(
             programs that hold controls themselves.
 
     Raises:
-        CdprError: As for `executor.jogging.jog`; a fault is latched.
+        CdprError: As for `executor.jogging.jog`; a fault is latched, but not an exception of
+            the listener, which stops the session.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     realtime = truth_value("realtime", realtime)
@@ -141,7 +142,8 @@ def cable_session(
             programs that hold controls themselves.
 
     Raises:
-        CdprError: As for `executor.jogging.jog_cable`; a fault is latched.
+        CdprError: As for `executor.jogging.jog_cable`; a fault is latched, but not an exception of
+            the listener, which stops the session.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     realtime = truth_value("realtime", realtime)
@@ -268,6 +270,7 @@ def _run(
     now = time.monotonic if realtime else lambda: clock.now
 
     callbacks = Callbacks(commands.board.ask_stop)
+    on_cycle = on_cycle and callbacks.guarded("on_cycle", on_cycle)
 
     def session() -> WinchResult:
         with ExitStack() as stack:

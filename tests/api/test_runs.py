@@ -434,15 +434,15 @@ def test_homing_shows_its_facts() -> None:
 
 
 class Broken(Listener):
-    """Its progress raises, either in the motion or as it closes."""
+    """Its progress raises, either in the motion from a share on, or as it closes."""
 
-    def __init__(self, error: BaseException, *, closing: bool) -> None:
-        self.error, self.closing = error, closing
+    def __init__(self, error: BaseException, *, closing: bool = False, since: float = 0.0) -> None:
+        self.error, self.closing, self.since = error, closing, since
 
     @contextmanager
     def progress(self, text: str, total: float | None) -> Iterator[Advance]:
         def advance(value: float, note: str = "", text: str = "") -> None:
-            if not self.closing:
+            if not self.closing and value >= self.since * (total or 1.0):
                 raise self.error
 
         yield advance
@@ -468,6 +468,17 @@ def test_a_listener_that_fails_stops_winches_and_is_named(
         with pytest.raises(type(error)) as left:
             move(rig, realtime=False, listener=Broken(error, closing=closing))
         assert left.value is error
+
+
+@pytest.mark.parametrize("since", [0.5, 1.0])
+def test_a_listener_that_fails_before_the_platform_is_measured_is_named_too(since: float) -> None:
+    """The stop it asks for ended the measurement, and passed for one by the operator."""
+    home = partial(cdpr.home, ready()[0], camera="synthetic", pictures=5, realtime=False)
+    with pytest.raises(cdpr.Fault, match=r"listener\.progress raised RuntimeError: no") as caught:
+        home(listener=Broken(error := RuntimeError("no terminal"), since=since))
+    assert caught.value.__cause__ is error
+    with pytest.raises(SystemExit):
+        home(listener=Broken(SystemExit(5), since=since))
 
 
 def test_the_record_of_winches_is_found_and_is_not_taken_for_a_run(

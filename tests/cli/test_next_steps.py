@@ -317,7 +317,8 @@ def test_status_states_the_error_of_a_drive_in_fault() -> None:
 @pytest.mark.parametrize("state", ["fault", "fault reaction active", "idle, in error"])
 def test_a_drive_in_fault_is_named_and_has_to_be_reset_before_it_is_homed(state: str) -> None:
     """A script saw neither the cause nor the step without which homing is refused."""
-    failed = DriveStatus(21, state, 0, 5.0, False, True, error="over-current (error 2310h)")
+    error = "over-current (error 2310h)"
+    failed = DriveStatus(21, state, 0, 5.0, False, True, error, in_fault=True)
     waits = DriveStatus(22, "switch on disabled", 0, 5.0, False, True, error="its STO is active")
     lost = replace(REFERENCED, counts=False, why_not="never homed")
     shown = dict(replace(STANDING, drives=(failed, waits), reference=lost).facts())

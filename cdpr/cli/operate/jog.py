@@ -132,7 +132,10 @@ def jog(
     distance: DistanceOptions,
     surroundings: SceneOptions,
     output: Path | None = option(
-        "run folder to create (default: runs/jog or runs/jog-cable, runs/jog-2 …)", "-o", "--output"
+        "folder to create (default: runs/jog, or runs/jog-cable with --cable, then -2 …; none for"
+        " --cable with simulated drives)",
+        "-o",
+        "--output",
     ),
     cable: int | None = option("move one winch by --mm", min=1),
     mm: float | None = option("length to pay out, at most 50; negative: wind in"),
