@@ -1,10 +1,10 @@
 """Whether this computer was busy with something else while a test ran in real time.
 
 Such a test depends on programs that are woken on time. Where they were not, a run rightly stops,
-and its failure says nothing about the code: it is done again. So is one in which a process of a
-run, which no thread of the test can watch, began a cycle late; so is one of a page whose data were
-stale for a moment, as it then refuses what is pressed. On a computer that kept time a
-failure counts at once.
+and its failure says nothing about the code: it is done again. Also repeated are those in which a
+process of a run, which no thread of the test can watch, began a cycle late, and those of a page
+whose data were stale for a moment, as it then refuses what is pressed. On a computer that kept time
+a failure counts at once.
 """
 
 from __future__ import annotations

@@ -63,6 +63,8 @@ NOTE_STALE = """() => {
 #: The page of each browser that the next visit has, by whether it takes touches.
 _KEPT: WeakKeyDictionary[Browser, dict[bool, Page]] = WeakKeyDictionary()
 
+#: What makes data stale, if the fake server is told so.
+_SILENCING = ("silent", "behind_ms", "hang_up", "refuse")
 PATIENCE_S = 30.0  # on a busy computer; what comes is waited for no longer than it takes
 expect.set_options(timeout=1000.0 * PATIENCE_S)
 
@@ -84,7 +86,8 @@ class Fake:
 
     def ask(self, **hooks: Any) -> dict[str, Any]:
         """Messages received so far, after ``hooks`` were set."""
-        self.silenced |= "silent" in hooks
+        asked = {**hooks, **hooks.get("set", {})}
+        self.silenced |= any(asked.get(name) for name in _SILENCING)
         data = json.dumps(hooks).encode() if hooks else None
         with urllib.request.urlopen(f"{self.origin}/fake", data=data, timeout=10) as answer:
             found = json.load(answer)
@@ -128,8 +131,11 @@ class Visit:
 
     def was_held_up(self) -> bool:
         """Whether data were stale, though the server was not told to be silent."""
+        return not self.fake.silenced and self._was_stale()
+
+    def _was_stale(self) -> bool:
         with contextlib.suppress(Error):  # the page may be closed
-            return not self.fake.silenced and bool(self.page.evaluate("() => window.wentStale"))
+            return bool(self.page.evaluate("() => window.wentStale"))
         return False
 
     def view(self, name: str) -> None:
@@ -267,17 +273,19 @@ class Visit:
         """Calls ``down``; a message of the press that it begins.
 
         A busy computer may hold the page up for so long that it refuses the press or ends it
-        itself, as it must: such a press is forgotten, and after ``up`` it is pressed again.
+        itself, as it must: where the page says so, it is forgotten, and after ``up`` pressed again.
         """
         for _ in range(5):
             first = self.fake.ask()
             down()
             found = self.fake.wait(self.page, lambda f, first=first: _pressed(f, first))  # type: ignore[misc]
             said = found["received"][len(first["received"]) :]
-            if said and all(message["kind"] == "held" for message in said):
+            if len(said) >= 2 and all(message["kind"] == "held" for message in said):
                 one = said[-1]
                 assert isinstance(one, dict)
                 return one
+            why = " ".join(self.page.locator("#jog-said, #cable-said").all_text_contents())
+            assert self._was_stale() or "page was delayed" in why, f"{said}: {why}"
             up()
             self.fake.let_pass(self.page, 4)
             self.fake.ask(set={"received": first["received"]})
@@ -285,7 +293,7 @@ class Visit:
 
 
 def _pressed(found: dict[str, Any], before: dict[str, Any]) -> bool:
-    """Whether two messages came since ``before``, or none for so long that none will."""
+    """Whether two messages came since ``before``, or for so long not that they will not."""
     more = len(found["received"]) - len(before["received"])
     return more >= 2 or found["ticks"] >= before["ticks"] + 40
 
