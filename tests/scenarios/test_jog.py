@@ -90,7 +90,6 @@ ONE = ("--cable", "3", "--mm", "1")
         ((*ONE, *BY), 2, "no effect here: --by-mm"),
         ((*ONE, "--to-home", "--scene", "none.yaml"), 2, "no effect here: --to-home, --scene"),
         ((*ONE, "--no-scene", "--clearance-mm", "0"), 2, "--no-scene, --clearance-mm"),
-        ((*ONE, "-o", "run"), 2, "no effect here: --output"),
     ],
 )
 def test_what_is_not_clearly_meant_moves_no_cable(
@@ -109,6 +108,7 @@ HELD = ("--hold-to-run", "--one-cable")
         ((*HELD, "--keys"), 2, "without --keys"),
         ((*HELD, "--limit-n", "101"), 3, "limit of 101 N"),
         ((*HELD, *BY), 2, "no effect here: --by-mm"),
+        ((*HELD, "-o", "run"), 2, "no effect here: --output"),
         ((*HELD, "--no-scene"), 2, "no effect here: --no-scene"),
         ((*HELD, "--fast"), 2, "no effect here: --fast"),
         (("--hold-to-run", "--no-scene", "--limit-n", "20"), 2, "no effect here: --limit-n"),

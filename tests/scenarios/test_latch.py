@@ -41,11 +41,13 @@ from tests.scenarios.test_real_time import real_time_process as process_of
 BUS = BusSettings("socketcan", "can0")
 
 
-def wait_until_beyond(path_mm: float) -> None:
-    """Waits until the run has progressed this far along its path, or ended."""
+def wait_until_beyond(path_mm: float, run: Path) -> None:
+    """Waits until the run has progressed this far along its path; fails with why it ended."""
     while True:
         with find_runs() as runs:
-            (answer,) = ask_all(runs, "status")
+            answers = ask_all(runs, "status")
+        assert answers, (run / "events.jsonl").read_text()
+        (answer,) = answers
         assert answer.status is not None
         if (answer.status["path_mm"] or 0.0) > path_mm:
             return
@@ -344,7 +346,7 @@ def test_after_a_crash_nothing_moves_until_reset_and_then_only_from_where_it_is(
         arguments = list(map(str, process.args))  # type: ignore[union-attr, arg-type]
         channel = arguments[arguments.index("--channel") + 1]
         child = process_of(process.pid)
-        wait_until_beyond(10.0)
+        wait_until_beyond(10.0, tmp_path / "run")
         process.kill()
         process.wait()
         wait_until_gone(child)
