@@ -132,10 +132,7 @@ def jog(
     distance: DistanceOptions,
     surroundings: SceneOptions,
     output: Path | None = option(
-        "folder to create (default: runs/jog, or runs/jog-cable with --cable, then -2 …; none for"
-        " --cable with simulated drives)",
-        "-o",
-        "--output",
+        "folder to create (default: runs/jog or, with --cable, runs/jog-cable)", "-o", "--output"
     ),
     cable: int | None = option("move one winch by --mm", min=1),
     mm: float | None = option("length to pay out, at most 50; negative: wind in"),
