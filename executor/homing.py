@@ -149,7 +149,7 @@ def home(
         Refused: The bus is latched, a limit cannot be kept, or the pose is too uncertain.
         HardwareMissing: A drive or the camera does not answer.
         Fault: It ended with a fault, which is latched; all drives stopped together and hold. Or a
-            function of the listener raised an exception, which stops the motion and latches none.
+            function of the listener raised an exception, which stops the motion without a latch.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     require_types((rig, Rig), (listener, Listener), optional=[(pose, Pose)])

@@ -317,7 +317,7 @@ def jog_cable(
         BadInput: There is no such cable, the length is zero, or an argument is of another type.
         Refused: The length is too long, or the bus is latched.
         Fault: A tension left its limits, which is latched; all drives stopped together. Or a
-            function of the listener raised an exception, which stops the motion and latches none.
+            function of the listener raised an exception, which stops the motion without a latch.
         StoppedByOperator: Cancelled, or stopped; the drives hold.
     """
     require_types((rig, Rig), (listener, Listener))
